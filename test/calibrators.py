@@ -159,3 +159,21 @@ def kept(state: CalibratorState) -> tuple[str, str]:
         if not state.rollback().success:
             break
     return ' '.join(map(str, numbers)), ' '.join(names)
+
+
+def scripts(text: str) -> dict[str, tuple[str, ...]]:
+    """
+    Cases by name: their steps, which stand below it, and what is expected, apart by bars.
+
+    ``none`` stands for an empty text; lines with ``#`` are comments.
+    """
+    cases: dict[str, tuple[str, ...]] = {}
+    name = ''
+    for line in text.strip().splitlines():
+        if line.startswith(' '):
+            steps, *expected = cases[name]
+            cases[name] = (f'{steps} {line.strip()}'.strip(), *expected)
+        elif not line.startswith('#'):
+            name, _, after = line.partition(' -> ')
+            cases[name] = ('', *(word.replace('none', '') for word in after.split(' | ')))
+    return cases

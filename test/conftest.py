@@ -3,27 +3,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator
 import contextlib
 import dataclasses
 import fcntl
-import functools
 import gc
-import inspect
 import io
 import os
 from pathlib import Path
 import shutil
 import signal
 import socket
-import subprocess
-import sys
-import time
-from typing import Any
 
-from forked_process import ForkedChild, ForkedNode, ForkedProcess  # type: ignore[import-not-found]
+from forked_process import ForkedChild  # type: ignore[import-not-found]
 import hypothesis
 import pytest
+from vehicle import Client, NodeProcess, StartNode, Vehicle  # type: ignore[import-not-found]
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -41,7 +36,6 @@ hypothesis.settings.register_profile(
 )
 hypothesis.settings.load_profile('any machine')
 
-START_S = 240.0  # a node starts in 2 s; much slower on two busy cores
 SLOW_S = 5.0  # of processor time: more than a test of one second takes on most machines
 FAILED = pytest.StashKey[bool]()  # in the stash of a test
 TINY = Path(__file__).parents[1] / 'bags' / 'tiny'
@@ -174,66 +168,10 @@ def domain_of_node_tests(request: pytest.FixtureRequest) -> None:
         request.getfixturevalue('ros_domain')
 
 
-class NodeProcess:
-    """A node as a separate process with its output in a file."""
-
-    def __init__(self, name: str, log: Path, arguments: list[str], forked: bool) -> None:
-        self.name = name
-        self._log = log
-        self.process: ForkedProcess | subprocess.Popen[bytes]
-        log.touch()
-        if forked:
-            self.process = ForkedNode(name, arguments, log)
-            return
-        with log.open('wb') as output:
-            self.process = subprocess.Popen(
-                [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
-            )
-
-    def said(self) -> str:
-        """Return the output so far."""
-        return self._log.read_text(errors='replace')
-
-    def wait(self, timeout_s: float = START_S) -> int:
-        """Wait for the end of the process; return its exit status.  One that hangs is killed."""
-        try:
-            return self.process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            # Python's fault handler answers SIGABRT with the stacks of all threads.
-            self.process.send_signal(signal.SIGABRT)
-            self.process.wait()
-            pytest.fail(f'{self.name} did not end in {timeout_s:.0f} s:\n{self.said()}')
-
-    def stop(self, number: int = signal.SIGINT) -> int:
-        """Send a signal and return the exit status, as `wait` does."""
-        self.send(number)
-        return self.wait()
-
-    def send(self, number: int = signal.SIGINT) -> None:
-        """Send a signal if the process still runs."""
-        if self.process.poll() is None:
-            self.process.send_signal(number)
-
-    def end(self) -> None:
-        """Wait for the end of the process; kill it if it does not end."""
-        try:
-            self.process.wait(START_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-
 @pytest.fixture
 def has_failed(request: pytest.FixtureRequest) -> Callable[[], bool]:
     """Whether the test has failed, for the teardown of fixtures."""
     return lambda: request.node.stash.get(FAILED, False)
-
-
-StartNode = Callable[..., NodeProcess]
 
 
 @pytest.fixture
@@ -247,12 +185,10 @@ def start_node(
     """
     started: list[NodeProcess] = []
 
-    def start(
-        name: str, *arguments: str, ros: tuple[str, ...] = (), forked: bool = True
-    ) -> NodeProcess:
-        ros_arguments = ['--ros-args', *ros] if ros else []
+    def start(name: str, *ros: str, forked: bool = True) -> NodeProcess:
+        arguments = ['--ros-args', *ros] if ros else []
         log = tmp_path / f'{name}{len(started)}.log'
-        started.append(NodeProcess(name, log, [*arguments, *ros_arguments], forked))
+        started.append(NodeProcess(name, log, arguments, forked))
         return started[-1]
 
     yield start
@@ -326,188 +262,20 @@ def tiny_products(made_once: MadeOnce, tiny_bag: Path) -> Path:
     return made_once('tiny_products', calibrate)
 
 
-def _seen(condition: Callable[..., object]) -> str:
-    """Values that a condition refers to, shortened; of lists the last element."""
-    function = condition.func if isinstance(condition, functools.partial) else condition
-    arguments = condition.args if isinstance(condition, functools.partial) else ()
-    looked_at = inspect.signature(function).bind(*arguments).arguments
-    if inspect.isfunction(function):
-        looked_at |= inspect.getclosurevars(function).nonlocals
-    for asked in [value for value in looked_at.values() if inspect.isfunction(value)]:
-        looked_at |= inspect.getclosurevars(asked).nonlocals
-    newest = {
-        name: (len(value), value[-1:]) if isinstance(value, list) else value
-        for name, value in looked_at.items()
-    }
-    return ', '.join(f'{name} = {str(value)[:600]}' for name, value in newest.items())
-
-
-class Client:
-    """A rclpy node that waits for conditions instead of sleeping."""
-
-    def __init__(self) -> None:
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
-
-        self._context = rclpy.Context()
-        rclpy.init(context=self._context)
-        self.node = rclpy.create_node('client', context=self._context)
-        self._executor = SingleThreadedExecutor(context=self._context)
-        self._executor.add_node(self.node)
-        self._diagnostics: list[Any] | None = None
-        self._statuses: list[Any] | None = None
-        self._services: dict[str, Any] = {}
-
-    def until(self, condition: Callable[[], object], timeout_s: float = START_S) -> None:
-        """Spin until a condition holds; fail after the timeout."""
-        deadline_s = time.monotonic() + timeout_s
-        while not condition():
-            assert time.monotonic() < deadline_s, f'timeout with {_seen(condition)}'
-            self._executor.spin_once(timeout_sec=0.05)
-
-    def call(
-        self,
-        kind: Any,
-        name: str,
-        timeout_s: float = START_S,
-        again_s: float = 40.0,
-        **fields: Any,
-    ) -> Any:
-        """
-        Call a service; without an answer after some time, call it once more.
-
-        A node may receive a request before discovery of the client; then its answer is lost.  The
-        client stays: once it has had an answer, that of a later call is not lost.
-        """
-        if name not in self._services:
-            self._services[name] = self.node.create_client(kind, name)
-        self.until(self._services[name].service_is_ready, timeout_s)
-        return self.ask(self._services[name], kind.Request(**fields), timeout_s, again_s)
-
-    def ask(
-        self, service: Any, request: Any, timeout_s: float = START_S, again_s: float = 40.0
-    ) -> Any:
-        """Call a service that is ready; without an answer after some time, call it once more."""
-        asked = [service.call_async(request)]
-        again_s += time.monotonic()
-
-        def is_answered() -> bool:
-            if len(asked) == 1 and time.monotonic() > again_s:
-                asked.append(service.call_async(request))
-            return any(future.done() for future in asked)
-
-        self.until(is_answered, timeout_s)
-        return next(future.result() for future in asked if future.done())
-
-    def collect(self, kind: Any, topic: str, qos: Any = 1000) -> list[Any]:
-        """Return a list that collects the messages of a topic."""
-        found: list[Any] = []
-        self.node.create_subscription(kind, topic, found.append, qos)
-        return found
-
-    def latched(self, kind: Any, topic: str) -> list[Any]:
-        """Return a list that collects the messages of a latched topic."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-
-        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        return self.collect(kind, topic, qos)
-
-    def publisher(self, kind: Any, topic: str, depth: int = 1000) -> Any:
-        """Return a publisher with at least one matched subscriber."""
-        publisher = self.node.create_publisher(kind, topic, depth)
-        self.until(publisher.get_subscription_count)
-        return publisher
-
-    def until_listened(self, name: str = 'star_observer', listeners: int = 1) -> None:
-        """
-        Wait until an observer reports that its observations have subscribers.
-
-        Discovery is not symmetric, and messages of a volatile publisher before the match are lost.
-        """
-        self.until(lambda: int(self.health(name)[2].get('listeners', 0)) >= listeners)
-
-    def health(self, name: str = 'star_observer') -> tuple[bytes, str, dict[str, str]]:
-        """Level, message and values of the latest diagnostics of a node; empty before them."""
-        from diagnostic_msgs.msg import DiagnosticArray
-
-        if self._diagnostics is None:
-            self._diagnostics = self.collect(DiagnosticArray, '/diagnostics')
-        for message in reversed(self._diagnostics):
-            for status in message.status:
-                if status.name == f'starcal: {name}':
-                    pairs = [(value.key, value.value) for value in status.values]
-                    assert len(dict(pairs)) == len(pairs), 'a key twice'
-                    return status.level, status.message, dict(pairs)
-        return b'', '', {}
-
-    def until_value(self, key: str, value: str, name: str = 'star_observer') -> None:
-        """Wait for a value in the diagnostics of a node."""
-        self.until(lambda: self.health(name)[2].get(key) == value)
-
-    def statuses(self) -> list[Any]:
-        """Return a list that collects what a calibrator reports of its images."""
-        if self._statuses is None:
-            from starcal.msg import EnsembleStatus
-
-            self._statuses = self.latched(EnsembleStatus, 'ensemble_status')
-        return self._statuses
-
-    def until_images(self, images: int, key: str = 'images') -> Any:
-        """Wait until a calibrator reports so many images; return its status."""
-        found = self.statuses()
-        self.until(lambda: found and getattr(found[-1], key) == images)
-        return found[-1]
-
-    def until_refused(self, *expected: tuple[str, int]) -> None:
-        """Wait until a calibrator reports these reasons of refused images and their counts."""
-        found = self.statuses()
-        self.until(
-            lambda: found and [(e.reason, e.count) for e in found[-1].refused] == [*expected]
-        )
-
-    def fill(self, images: Sequence[Any]) -> None:
-        """Publish observations to a calibrator; wait until it has all of them."""
-        from starcal.msg import StarObservations
-        from starcal_ros.formats.messages.record_messages import observations_to_message
-        from starcal_ros.ros.node import make_message
-
-        publisher = self.publisher(StarObservations, 'observations')
-        for image in images:
-            publisher.publish(observations_to_message(image, 'camera', make_message))
-        self.until_images(len(images))
-
-    def close(self) -> None:
-        """Leave the graph."""
-        self._executor.shutdown()
-        self.node.destroy_node()
-        self._context.try_shutdown()
-
-
 @pytest.fixture
 def client(ros_domain: None) -> Iterator[Client]:
     """A client node for one test."""
     pytest.importorskip('rclpy')
     pytest.importorskip('starcal.msg')
-    one = Client()
-    yield one
-    one.close()
+    with contextlib.closing(Client()) as one:
+        yield one
 
 
 @pytest.fixture
-def other_client(ros_domain: None) -> Iterator[Client]:
-    """A second client node; it answers requests only while it is spun."""
-    pytest.importorskip('rclpy')
-    one = Client()
-    yield one
-    one.close()
-
-
-@pytest.fixture(scope='session')
-def tiny_observations() -> Any:
-    """Simulated observations of scenario tiny, without pixels."""
-    synthetic = pytest.importorskip('starcal_ground.simulation.scenario')
-    centroids = pytest.importorskip('starcal_ground.simulation.centroids')
-    return centroids.true_observations(synthetic.scenario('tiny'))
+def vehicle(start_node: StartNode, tiny_bag: Path) -> Iterator[Vehicle]:
+    """A client of the nodes that it starts, for one test."""
+    with contextlib.closing(Vehicle(start_node, tiny_bag)) as one:
+        yield one
 
 
 @pytest.fixture(scope='session')

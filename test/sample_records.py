@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from starcal_ros.camera import CameraModel
+from starcal_ros.record_fields import fields_of
 from starcal_ros.records import (
     Amplitude,
     Calibration,
@@ -210,6 +211,28 @@ def status() -> EnsembleStatus:
         predicted_sigma=np.array([1.5, np.inf]),
         images_saved=2,
     )
+
+
+def zeroed(value: Any, is_sequence: bool) -> Any:
+    """Return what ROS has in a field that a sender leaves out."""
+    if isinstance(value, np.ndarray):
+        return value[:0] if is_sequence else np.zeros_like(value)
+    if hasattr(value, 'w'):
+        return type(value)(x=0.0, y=0.0, z=0.0, w=0.0)
+    return type(value)()
+
+
+def with_needed_fields(sent: StarObservations, **others: Any) -> StarObservations:
+    """Observations with the fields that a message must have, and these others."""
+    needed = {
+        name: getattr(sent, name)
+        for name, kind in fields_of(StarObservations).items()
+        if not kind.has_default and name not in ('time_ns', 'width', 'height')
+    }
+    unknown = np.full(len(sent), np.nan, np.float32)
+    stars = dict.fromkeys(('magnitude', 'flux_dn', 'snr'), unknown)
+    size = sent.width, sent.height
+    return StarObservations.of_image(sent.time_ns, size, **needed, **stars, **others)
 
 
 def plain(_type: str, /, **fields: Any) -> SimpleNamespace:

@@ -13,7 +13,11 @@ from starcal_ground.simulation.scenario import Detector, Scenario, Scene, scene
 from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, StarObservations
+from starcal_ros.stars.centroiding import Centroids, measure_stars
+from starcal_ros.stars.detection import detect, measure_background
+from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
 
+CENTROIDS = CentroidOptions()
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
 # Venus, Jupiter, Mars, Saturn, Mercury, and Uranus, which resembles a star.
 PLANET_MAGNITUDES = np.array([-4.2, -2.3, -1.0, 0.4, 1.5, 5.8])
@@ -24,6 +28,19 @@ def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = (512, 640))
     v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
     phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
     return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
+
+
+def modelled(pixels: np.ndarray, options: CentroidOptions = CENTROIDS) -> ImageModel:
+    """Model of an image by the stars that it shows."""
+    background = measure_background(pixels)
+    return model_image(pixels, background, detect(pixels, background), options)
+
+
+def measured(
+    pixels: np.ndarray, xy: np.ndarray, options: CentroidOptions = CENTROIDS
+) -> Centroids:
+    """Centroids of the stars of an image that are at or near these pixels (n, 2)."""
+    return measure_stars(pixels, xy, modelled(pixels, options), options)
 
 
 def with_planets(scenario: Scenario, shown: Scene, seed: int) -> Scene:

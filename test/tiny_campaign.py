@@ -8,11 +8,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.rendering import render
 from starcal_ground.simulation.scenario import attitude_samples, scenario, scene
-from starcal_ros.records import Ensemble, Image
+from starcal_ros.records import AttitudeSample, Ensemble, Image
 from starcal_ros.sky.attitude import AttitudeHistory
 
 SCENARIO = scenario('tiny', seed=7)
@@ -39,10 +40,15 @@ def image(index: int = 1) -> Image:
     return render(SCENARIO, scene(SCENARIO, index), index)
 
 
-def attitudes(index: int = 1) -> AttitudeHistory:
+def attitudes(*indices: int, turn: Rotation | None = None) -> AttitudeHistory:
+    """Samples about images, number 1 by default; the star tracker may report a turn too much."""
     held = AttitudeHistory()
-    for sample in attitude_samples(SCENARIO, index):
-        held.add(sample.time_ns, sample)
+    for index in indices or (1,):
+        for sample in attitude_samples(SCENARIO, index):
+            if turn is not None:
+                reported = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw) * turn
+                sample = AttitudeSample(sample.time_ns, reported.as_quat())
+            held.add(sample.time_ns, sample)
     return held
 
 

@@ -6,13 +6,14 @@ from __future__ import annotations
 import dataclasses
 
 from export_calibrations import calibration  # type: ignore[import-not-found]
+from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.trend.fleet import row_of, Task
 from starcal_ground.mission.trend.trend_table import RECORDED, Row
 from starcal_ros.constants import ARCSECOND_RAD
-from starcal_ros.records import Calibration, CameraGeometry
+from starcal_ros.records import Calibration
 
 DAY_NS = 86400 * 10**9
 
@@ -20,9 +21,7 @@ DAY_NS = 86400 * 10**9
 def made(day: int, rotation_arcsec: tuple[float, ...] = (0, 0, 0), **changed: object) -> Row:
     """Row of a day, its camera turned by a rotation about its axes."""
     one: Calibration = calibration()
-    before = Rotation.from_quat(one.geometry.star_tracker_from_camera_xyzw)
-    after = before * Rotation.from_rotvec(np.array(rotation_arcsec) * ARCSECOND_RAD)
-    geometry = CameraGeometry(one.geometry.camera, after.as_quat())
+    turn = Rotation.from_rotvec(np.array(rotation_arcsec) * ARCSECOND_RAD)
     stamps = {'first_image_ns': day * DAY_NS, 'time_ns': day * DAY_NS + 100}
-    one = dataclasses.replace(one, geometry=geometry, **stamps, **changed)  # type: ignore[arg-type]
+    one = dataclasses.replace(one, geometry=turned(one.geometry, turn), **stamps, **changed)  # type: ignore[arg-type]
     return row_of(Task(f'/{day}', str(day)), RECORDED, one)

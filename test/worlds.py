@@ -16,6 +16,7 @@ import sys
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
+from geometries import turn_between  # type: ignore[import-not-found]
 import numpy as np
 import scipy
 from scipy.spatial.transform import Rotation
@@ -165,10 +166,7 @@ def _locked(path: Path) -> Iterator[None]:
 
 def errors_of(found: Estimate, truth: CameraGeometry) -> Floats:
     """Errors (p + 3,): of the camera parameters, and the passive turn of the camera frame, rad."""
-    one, other = (
-        Rotation.from_quat(g.star_tracker_from_camera_xyzw) for g in (found.geometry, truth)
-    )
-    turn = -(one.inv() * other).as_rotvec()
+    turn = -turn_between(found.geometry, truth).as_rotvec()
     return np.asarray(np.r_[found.geometry.camera.parameters - truth.camera.parameters, turn])
 
 

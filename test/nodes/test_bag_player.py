@@ -8,18 +8,18 @@ import itertools
 from pathlib import Path
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import cv2
 from geometry_msgs.msg import PoseStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
-from node_inputs import parameters  # type: ignore[import-not-found]
 import pytest
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from sample_records import assert_same, observations  # type: ignore[import-not-found]
 from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
+from vehicle import Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import StarObservations
 from starcal_ground.bag_writer import BagWriter
@@ -40,9 +40,6 @@ from starcal_ros.formats.messages.record_messages import (
     observations_from_message,
     observations_to_message,
 )
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -75,19 +72,26 @@ def bag(tmp_path: Path) -> Path:
     return tmp_path / 'bag'
 
 
-def test_compressed_images_are_paced(
-    client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
+def test_compressed_images_are_paced_for_the_node_that_observes(
+    vehicle: Vehicle, bag: Path
 ) -> None:
-    """A queue of twenty overflows where they are not; each is answered once, in order."""
-    found: list[Any] = client.collect(StarObservations, 'observations')
-    given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
-    start_node('star_observer', ros=(*given, '-r', 'image:=image/compressed'))
-    client.until_listened()
-    patient = ('-p', 'wait_for_subscribers_s:=100.0')
-    player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0', *patient))
+    """
+    A queue of twenty overflows where they are not; each is answered once, in order.
+
+    Other subscribers of images and attitudes may start first; the first images were lost.
+    """
+    found: list[Any] = vehicle.collect(StarObservations, 'observations')
+    vehicle.collect(CompressedImage, '/image/compressed')
+    vehicle.collect(PoseStamped, '/attitude')
+    patient = 'wait_for_subscribers_s:=100.0'
+    player = vehicle.start_player(bag, patient, 'wait_for_topic:=observations')
+    vehicle.until(lambda: bool(vehicle.node.count_publishers('/attitude')))
+    time.sleep(1.5)  # three times as long as the player waits for further subscribers
+    ros = ('-r', 'image:=image/compressed')
+    vehicle.start('star_observer', 'attitude_timeout_s:=60.0', ros=ros)
     assert player.wait() == 0, player.said()
-    client.until(lambda: len(found) == IMAGES)
-    assert [one.refusal for one in found] == [''] * len(found)
+    vehicle.until(lambda: len(found) == IMAGES)
+    assert [one.refusal for one in found] == [''] * IMAGES
     assert all(len(one.catalog_id) > 50 for one in found)
     stamps_ns = [stamp_ns(one.header.stamp) for one in found]
     sent = reader.read_raw([bag], ['/image/compressed'])
@@ -95,26 +99,8 @@ def test_compressed_images_are_paced(
     assert 'playing anyway' not in player.said()
 
 
-def test_the_node_that_observes_is_waited_for(
-    client: Client, start_node: StartNode, tiny_bag: Path, bag: Path
-) -> None:
-    """Other subscribers of images and attitudes may start first; the first images were lost."""
-    found: list[Any] = client.collect(StarObservations, 'observations')
-    client.collect(CompressedImage, '/image/compressed')
-    client.collect(PoseStamped, '/attitude')
-    play = ('-p', f'bag:={bag}', '-p', 'rate:=0.0', '-p', 'wait_for_subscribers_s:=100.0')
-    player = start_node('bag_player', ros=(*play, '-p', 'wait_for_topic:=observations'))
-    client.until(lambda: bool(client.node.count_publishers('/attitude')))
-    time.sleep(1.5)  # three times as long as the player waits for further subscribers
-    given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
-    start_node('star_observer', ros=(*given, '-r', 'image:=image/compressed'))
-    assert player.wait() == 0, player.said()
-    client.until(lambda: len(found) == IMAGES)
-    assert [one.refusal for one in found] == [''] * IMAGES
-
-
 def test_what_was_latched_is_latched(
-    client: Client, start_node: StartNode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As /tf_static, whose listeners connect to no publisher of another durability."""
     as_recorded = {**typestore.offered_qos(), 'durability': 'transient_local'}
@@ -122,15 +108,13 @@ def test_what_was_latched_is_latched(
     with BagWriter(tmp_path / 'latched.mcap') as writer:
         message = make_message('std_msgs/msg/String', data='kept')
         writer.write('/latched', 'std_msgs/msg/String', 5, message)
-    found = client.latched(String, '/latched')
-    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "latched.mcap"}'))
-    client.until(lambda: bool(found))
+    found = vehicle.latched(String, '/latched')
+    player = vehicle.start_player(tmp_path / 'latched.mcap')
+    vehicle.until(lambda: bool(found))
     assert player.wait() == 0 and [one.data for one in found] == ['kept']
 
 
-def test_of_several_types_on_a_topic_one_is_played(
-    client: Client, start_node: StartNode, tmp_path: Path
-) -> None:
+def test_of_several_types_on_a_topic_one_is_played(vehicle: Vehicle, tmp_path: Path) -> None:
     """The bytes of the others went out as messages of it; a name of another tool ended it."""
     with BagWriter(tmp_path / 'mixed.mcap') as writer:
         for k, topic in enumerate(('/mixed', '/mixed', '/mixed', '/of another tool')):
@@ -143,17 +127,16 @@ def test_of_several_types_on_a_topic_one_is_played(
             )
             writer._channels.pop(topic, None)
             writer.write(topic, kind, k, make_message(kind, **fields))
-    found: list[Any] = client.collect(String, '/mixed')
-    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "mixed.mcap"}'))
-    assert player.wait() == 0, player.said()
-    client.until(lambda: len(found) == 2)
+    found: list[Any] = vehicle.collect(String, '/mixed')
+    player = vehicle.play(tmp_path / 'mixed.mcap')
+    vehicle.until(lambda: len(found) == 2)
     assert [one.data for one in found] == ['0', '2']
     assert f'/mixed: {TEMPERATURE_TYPE} is not std_msgs/msg/String: skipped' in player.said()
     assert 'String is on no topic that ROS can have: skipped' in player.said()
 
 
 def test_messages_of_another_version_are_played_as_those_of_this_one(
-    client: Client, start_node: StartNode, tmp_path: Path
+    vehicle: Vehicle, tmp_path: Path
 ) -> None:
     """Their bytes went out as they were, and their fields were read as others."""
     now = typestore.described(OBSERVATIONS_TYPE)[0]
@@ -174,10 +157,9 @@ def test_messages_of_another_version_are_played_as_those_of_this_one(
             for k in range(3):
                 writer.add_message(channel, k, bytes(data), publish_time=k)
         writer.finish()
-    found, other = (client.collect(StarObservations, topic) for topic in ('/older', '/other'))
-    player = start_node('bag_player', ros=('-p', f'bag:={bag}'))
-    assert player.wait() == 0, player.said()
-    client.until(lambda: len(found) == 3)
+    found, other = (vehicle.collect(StarObservations, topic) for topic in ('/older', '/other'))
+    player = vehicle.play(bag)
+    vehicle.until(lambda: len(found) == 3)
     assert other == []
     for one in found:
         assert_same(observations_from_message(one), replace(observations(), detail=''))

@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from pathlib import Path
 import threading
 from types import SimpleNamespace
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from geometry_msgs.msg import TransformStamped
-from node_inputs import in_this_process  # type: ignore[import-not-found]
 import pytest
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo
 from std_srvs.srv import Trigger
+from vehicle import Client, in_this_process, tiny_observations  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration
 from starcal_ros.formats.messages.record_messages import (
@@ -22,24 +22,18 @@ from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     camera_info_to_message,
 )
-from starcal_ros.records import Ensemble
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.state import Answer
-
-if TYPE_CHECKING:
-    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 
 
 @pytest.fixture
-def calibrator(
-    ros_domain: None, tiny_bag: Path, tiny_observations: Ensemble
-) -> Iterator[Calibrator]:
+def calibrator(ros_domain: None, tiny_bag: Path) -> Iterator[Calibrator]:
     """An active calibrator in this process that holds the images of the small bag."""
     with in_this_process(Calibrator, tiny_bag) as node:
-        for image in tiny_observations.images:
+        for image in tiny_observations().images:
             node._state.add(image)
         yield node
 

@@ -4,23 +4,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 import subprocess
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
-from node_inputs import parameters  # type: ignore[import-not-found]
 import pytest
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 from sensor_msgs.srv import SetCameraInfo
-from std_srvs.srv import Trigger
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
-    from starcal_ros.records import Ensemble
+from vehicle import Client, Vehicle  # type: ignore[import-not-found]
 
 pytestmark = pytest.mark.nodes
 
@@ -69,28 +63,19 @@ def until_told(client: Client, outcome: str, level: bytes) -> None:
     client.until(is_so)
 
 
-def test_driver_is_told_and_its_failures_are_seen(
-    client: Client,
-    other_client: Client,
-    start_node: StartNode,
-    tiny_bag: Path,
-    tiny_observations: Ensemble,
-) -> None:
+def test_driver_is_told_and_its_failures_are_seen(vehicle: Vehicle) -> None:
     """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
-    calibrator = start_node(
-        'calibrator', ros=parameters(tiny_bag, f'set_camera_info_service:={SERVICE}')
-    )
-    client.fill(tiny_observations.images)
-    assert client.call(Trigger, '/calibrator/calibrate').success
+    calibrator = vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
+    vehicle.calibrate()
 
-    until_told(client, 'service not available; will be sent when it is', b'\x01')
+    until_told(vehicle, 'service not available; will be sent when it is', b'\x01')
 
     # A driver that takes the call and never answers: nobody spins its node.
-    silent = other_client.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
-    until_told(client, 'no answer within 5 s', b'\x01')
-    # The first failure was that the service was not there; then it is called again.
-    client.until(lambda: int(client.health('calibrator')[2]['camera_driver_failures']) >= 3)
-    other_client.node.destroy_service(silent)
+    with closing(Client()) as silent:
+        silent.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
+        until_told(vehicle, 'no answer within 5 s', b'\x01')
+        # The first failure was that the service was not there; then it is called again.
+        vehicle.until(lambda: int(vehicle.health('calibrator')[2]['camera_driver_failures']) >= 3)
 
     received: list[Any] = []
     accepts = False
@@ -101,18 +86,17 @@ def test_driver_is_told_and_its_failures_are_seen(
         response.status_message = '' if accepts else 'sensor\nbusy'
         return response
 
-    client.node.create_service(SetCameraInfo, SERVICE, answer)
-    until_told(client, 'refused: sensor busy', b'\x01')
+    vehicle.node.create_service(SetCameraInfo, SERVICE, answer)
+    until_told(vehicle, 'refused: sensor busy', b'\x01')
 
     accepts = True  # it is called again without a request
-    until_told(client, 'accepted', b'\x00')
-    published = client.latched(CameraInfo, 'camera_info')
-    client.until(lambda: published)
+    until_told(vehicle, 'accepted', b'\x00')
+    published = vehicle.until_latched(CameraInfo, 'camera_info')
     assert received[-1] == published[-1]
 
     before = len(received)
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    client.until(lambda: len(received) > before)
+    vehicle.calibrate()
+    vehicle.until(lambda: len(received) > before)
     said = calibrator.said()
     for outcome in (
         'service not available',
@@ -124,26 +108,18 @@ def test_driver_is_told_and_its_failures_are_seen(
     assert 'Traceback' not in said
 
 
-def test_a_driver_process_that_restarts(
-    client: Client,
-    start_node: StartNode,
-    tiny_bag: Path,
-    tiny_observations: Ensemble,
-    tmp_path: Path,
-) -> None:
+def test_a_driver_process_that_restarts(vehicle: Vehicle, tmp_path: Path) -> None:
     """
     A driver in another process receives the calibration that was active before it started.
 
     The next one starts at once, while DDS takes the one that was killed as still there.
     """
-    start_node('calibrator', ros=parameters(tiny_bag, f'set_camera_info_service:={SERVICE}'))
-    client.fill(tiny_observations.images)
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    published = client.latched(CameraInfo, 'camera_info')
-    client.until(lambda: published)
+    vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
+    vehicle.calibrate()
+    published = vehicle.until_latched(CameraInfo, 'camera_info')
     for name in ('first', 'second'):
         kept = tmp_path / name
         with driver(kept):
-            client.until(kept.exists)
-            until_told(client, 'accepted', b'\x00')
+            vehicle.until(kept.exists)
+            until_told(vehicle, 'accepted', b'\x00')
         assert deserialize_message(kept.read_bytes(), CameraInfo) == published[-1]

@@ -6,12 +6,12 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from geometry_msgs.msg import TransformStamped
-from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 import pytest
 from sensor_msgs.msg import CameraInfo, Image
+from vehicle import IMAGES, REMAPS, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration
 from starcal_ground.bags import reader
@@ -20,9 +20,6 @@ from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_ca
 from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -39,36 +36,33 @@ HEIRS = {
 
 @pytest.mark.parametrize('name', HEIRS)
 def test_consumers_return_to_the_prior(
-    name: str, client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path,
-    tmp_path: Path,
-) -> None:  # fmt: skip
+    vehicle: Vehicle, name: str, tiny_products: Path, tmp_path: Path
+) -> None:
     """The star observer, the camera of each image, and the monitor; and back to a calibration."""
     values, folder, why = HEIRS[name]
     stored = read_calibration(tiny_products / CALIBRATION_FILE)
     stored = dataclasses.replace(stored, number=1, active_since_ns=1)
     with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
         archive.keep(EnsembleRecord(), (Activation(1, 0, stored),))
-    start_node('star_observer', ros=(*parameters(tiny_bag, 'attitude_timeout_s:=0.0'), *REMAPS))
-    ros = parameters(tiny_bag, f'state_dir:={tmp_path}/state')
-    first = start_node('calibrator', ros=ros)
-    client.until_value('calibration', '1')
-    infos: list[Any] = client.collect(CameraInfo, 'image_camera_info')
-    images = client.publisher(Image, IMAGES)
-    image = next(reader.read_raw([tiny_bag], [IMAGES])).data
-    client.until(lambda: (images.publish(image), infos)[1])
+    vehicle.start('star_observer', 'attitude_timeout_s:=0.0', ros=REMAPS)
+    kept = f'state_dir:={tmp_path}/state'
+    first = vehicle.start('calibrator', kept)
+    vehicle.until_value('calibration', '1')
+    infos: list[Any] = vehicle.collect(CameraInfo, 'image_camera_info')
+    images = vehicle.publisher(Image, IMAGES)
+    image = next(reader.read_raw([vehicle.bag], [IMAGES])).data
+    vehicle.until(lambda: (images.publish(image), infos)[1])
     assert infos[-1].k[0] > 0
 
-    monitor = Monitor(client._context)
-    client._executor.add_node(monitor)
-    client.until(lambda: monitor.received.active is not None)
+    monitor = Monitor(vehicle._context)
+    vehicle._executor.add_node(monitor)
+    vehicle.until(lambda: monitor.received.active is not None)
     first.stop()
     place = f'state_dir:={tmp_path}/{folder}'
-    heir = start_node(
-        'calibrator', ros=(*parameters(tiny_bag, place, *values), '-r', '__node:=heir')
-    )
-    client.until_value('calibration', 'prior')
-    client.until(lambda: 'images' in client.health('heir')[2])
-    level, text, values = client.health('heir')
+    heir = vehicle.start('calibrator', place, *values, ros=('-r', '__node:=heir'))
+    vehicle.until_value('calibration', 'prior')
+    vehicle.until(lambda: 'images' in vehicle.health('heir')[2])
+    level, text, values = vehicle.health('heir')
     withheld = str(int(bool(why)))
     assert (values['active'], values['state_refused_calibrations']) == ('none', withheld)
     if why:
@@ -76,21 +70,21 @@ def test_consumers_return_to_the_prior(
         assert 'max_change_px' in text and text in heir.said()
         assert values['last_gate'] == f'refused: {text}'
     assert f'state_dir {tmp_path}/{folder}; no calibration active; 0 images' in heir.said()
-    client.until(lambda: client.health()[0] == b'\x01')
-    assert 'the prior predicts the stars' in client.health()[1] and why in client.health()[1]
-    client.until(lambda: monitor.received.active is None)
+    vehicle.until(lambda: vehicle.health()[0] == b'\x01')
+    assert 'the prior predicts the stars' in vehicle.health()[1] and why in vehicle.health()[1]
+    vehicle.until(lambda: monitor.received.active is None)
     assert why in monitor.received.why_none
-    client._executor.remove_node(monitor)
+    vehicle._executor.remove_node(monitor)
     monitor.destroy_node()
-    client.until(lambda: (images.publish(image), infos[-1].k[0] == 0)[1])
+    vehicle.until(lambda: (images.publish(image), infos[-1].k[0] == 0)[1])
     assert not infos[-1].k.any() and infos[-1].width == stored.geometry.camera.width
     assert infos[-1].header.frame_id != ''
 
     # A late subscriber is told so too.
-    calibrations = client.latched(Calibration, 'calibration')
-    cameras = client.latched(CameraInfo, 'camera_info')
-    alignments = client.latched(TransformStamped, 'alignment')
-    client.until(lambda: calibrations and cameras and alignments)
+    calibrations = vehicle.latched(Calibration, 'calibration')
+    cameras = vehicle.latched(CameraInfo, 'camera_info')
+    alignments = vehicle.latched(TransformStamped, 'alignment')
+    vehicle.until(lambda: calibrations and cameras and alignments)
     (none,) = calibrations
     assert (none.number, none.accepted, none.camera.width) == (0, False, 0)
     assert [why in reason for reason in none.reasons] == [True] * bool(why)
@@ -99,6 +93,6 @@ def test_consumers_return_to_the_prior(
     assert (rotation.x, rotation.y, rotation.z, rotation.w) == (0.0, 0.0, 0.0, 0.0)
 
     heir.stop()
-    start_node('calibrator', ros=(*ros, '-r', '__node:=third'))
-    client.until_value('calibration', '1')
-    client.until(lambda: 'the prior predicts the stars' not in client.health()[1])
+    vehicle.start('calibrator', kept, ros=('-r', '__node:=third'))
+    vehicle.until_value('calibration', '1')
+    vehicle.until(lambda: 'the prior predicts the stars' not in vehicle.health()[1])

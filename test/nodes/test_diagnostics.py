@@ -8,24 +8,20 @@ import itertools
 import math
 from pathlib import Path
 import re
-from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import QuaternionStamped, Twist, TwistStamped
-from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 import pytest
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
+from vehicle import ATTITUDES, BOTH, IMAGES, REMAPS, tiny_observations, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal_ground.bags import reader
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
-from starcal_ros.records import Ensemble, IMAGE_REFUSALS
+from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros.node import make_message
 from starcal_ros.sky.astrometry import earth_velocity_c
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -46,25 +42,22 @@ def documented(*tables: str) -> set[str]:
     return keys
 
 
-def test_observer_says_what_the_document_says(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    patient = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
-    start_node('star_observer', ros=(*patient, *REMAPS))
-    client.until(lambda: client.health()[1] == 'waiting for images')
-    level, _, values = client.health()
+def test_observer_says_what_the_document_says(vehicle: Vehicle) -> None:
+    vehicle.start('star_observer', 'attitude_timeout_s:=60.0', ros=REMAPS)
+    vehicle.until(lambda: vehicle.health()[1] == 'waiting for images')
+    level, _, values = vehicle.health()
     assert level == b'\x00' and set(values) == documented('star_observer')
     assert values['latency_median_s'] == values['attitude_gap_s'] == 'none'
 
-    images = client.publisher(Image, IMAGES, 10)
-    attitudes = client.publisher(QuaternionStamped, ATTITUDES)
-    samples = list(reader.read_raw([tiny_bag], [ATTITUDES]))
-    images.publish(next(reader.read_raw([tiny_bag], [IMAGES])).data)
+    images = vehicle.publisher(Image, IMAGES, 10)
+    attitudes = vehicle.publisher(QuaternionStamped, ATTITUDES)
+    samples = list(reader.read_raw([vehicle.bag], [ATTITUDES]))
+    images.publish(next(reader.read_raw([vehicle.bag], [IMAGES])).data)
     for sample in samples:
         attitudes.publish(sample.data)
-    client.until_value('images_used', '1')
-    client.until_value('attitudes', str(len(samples)))
-    level, text, values = client.health()
+    vehicle.until_value('images_used', '1')
+    vehicle.until_value('attitudes', str(len(samples)))
+    level, text, values = vehicle.health()
     assert (level, text) == (b'\x00', 'observing')
     assert set(values) == documented('star_observer')
     stamps_ns = [sample.log_time_ns for sample in samples]
@@ -76,38 +69,30 @@ def test_observer_says_what_the_document_says(
     assert values['callback_errors'] == '0'
 
 
-def test_images_that_the_middleware_loses_are_counted(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_images_that_the_middleware_loses_are_counted(vehicle: Vehicle) -> None:
     """A publisher with a short history sends large images faster than they can be received."""
-    start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    images = client.publisher(Image, IMAGES, 1)
+    vehicle.start('star_observer', ros=REMAPS)
+    images = vehicle.publisher(Image, IMAGES, 1)
     large = make_message('sensor_msgs/msg/Image', width=2592, height=2048, encoding='mono8')
     large.data = array.array('B', bytes(2592 * 2048))
 
     def is_counted() -> bool:
         images.publish(large)
-        return 'lost before they reached the node' in client.health()[1]
+        return 'lost before they reached the node' in vehicle.health()[1]
 
-    client.until(is_counted)
-    level, _, values = client.health()
+    vehicle.until(is_counted)
+    level, _, values = vehicle.health()
     assert level == b'\x01' and int(values['images_lost']) > 0
 
 
-def test_calibrator_diagnostics_match_the_document(
-    client: Client,
-    start_node: StartNode,
-    tiny_bag: Path,
-    tiny_observations: Ensemble,
-    tmp_path: Path,
-) -> None:
+def test_calibrator_diagnostics_match_the_document(vehicle: Vehicle, tmp_path: Path) -> None:
     """While collecting, with a damaged state file, and with an active calibration."""
     history = tmp_path / 'state' / 'calibrations'
     history.mkdir(parents=True)
     (history / '00000001_calibration_00000001.json').write_text('{"schema": 1}')
-    start_node('calibrator', ros=parameters(tiny_bag, f'state_dir:={tmp_path / "state"}'))
-    client.until(lambda: 'images' in client.health('calibrator')[2])
-    level, text, values = client.health('calibrator')
+    vehicle.start('calibrator', f'state_dir:={tmp_path / "state"}')
+    vehicle.until(lambda: 'images' in vehicle.health('calibrator')[2])
+    level, text, values = vehicle.health('calibrator')
     assert set(values) == documented('calibrator')
     assert level == b'\x01' and text.startswith('set aside as damaged: ')
     assert '00000001_calibration_00000001.json' in text
@@ -115,10 +100,10 @@ def test_calibrator_diagnostics_match_the_document(
     assert (values['active'], values['calibration_age_s']) == ('none', 'none')
     assert (values['last_gate'], values['camera_driver']) == ('none', 'none')
 
-    client.fill(tiny_observations.images)
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    client.until(lambda: client.health('calibrator')[2].get('active') != 'none')
-    _, _, values = client.health('calibrator')
+    vehicle.fill(tiny_observations().images)
+    vehicle.calibrate()
+    vehicle.until(lambda: vehicle.health('calibrator')[2].get('active') != 'none')
+    _, _, values = vehicle.health('calibrator')
     assert set(values) == documented('calibrator')
     assert values['last_gate'] == 'accepted'
     # On this machine's clock, within the time a test may take.
@@ -126,25 +111,25 @@ def test_calibrator_diagnostics_match_the_document(
     assert math.isfinite(float(values['disk_free_mb']))
 
 
-def test_nodes_that_are_not_active(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+def test_nodes_that_are_not_active(vehicle: Vehicle) -> None:
     for name in BOTH:
-        start_node(name, ros=parameters(tiny_bag, 'autostart:=false'))
+        vehicle.start(name, 'autostart:=false')
     for name in BOTH:
-        client.until(lambda name=name: client.health(name)[0])
-        level, text, values = client.health(name)
+        vehicle.until(lambda name=name: vehicle.health(name)[0])
+        level, text, values = vehicle.health(name)
         assert (level, text) == (b'\x01', 'not active: unconfigured')
         assert set(values) == documented()
 
 
 def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_received(
-    client: Client, start_node: StartNode, tiny_bag: Path
+    vehicle: Vehicle,
 ) -> None:
     """Best effort, as drivers offer it: all inputs connect, remapped or not."""
-    node = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    client.until(lambda: f'{ATTITUDES}: no message in 5 s, from 0 pub' in node.said())
+    node = vehicle.start('star_observer', ros=REMAPS)
+    vehicle.until(lambda: f'{ATTITUDES}: no message in 5 s, from 0 pub' in node.said())
     assert node.said().count(f'{IMAGES}: no message in 5 s') == 1
     publishers = [
-        client.node.create_publisher(kind, topic, qos_profile_sensor_data)
+        vehicle.node.create_publisher(kind, topic, qos_profile_sensor_data)
         for kind, topic in (
             (QuaternionStamped, ATTITUDES),
             (TwistStamped, '/spacecraft/velocity'),
@@ -152,23 +137,21 @@ def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_rece
             (Image, IMAGES),
         )
     ]
-    client.until(lambda: all(one.get_subscription_count() for one in publishers))
+    vehicle.until(lambda: all(one.get_subscription_count() for one in publishers))
     # Where all connect, nothing is left to warn of.
-    client.until(lambda: client.health()[:2] == (b'\x00', 'waiting for images'))
+    vehicle.until(lambda: vehicle.health()[:2] == (b'\x00', 'waiting for images'))
     publishers[0].publish(QuaternionStamped())
-    client.until_value('messages', '1')
+    vehicle.until_value('messages', '1')
 
 
-def test_a_driver_in_another_namespace_is_named(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_a_driver_in_another_namespace_is_named(vehicle: Vehicle) -> None:
     for name in BOTH:
-        start_node(name, ros=parameters(tiny_bag))
-    client.node.create_publisher(Image, '/sat2/camera/image_raw', 10)
+        vehicle.start(name)
+    vehicle.node.create_publisher(Image, '/sat2/camera/image_raw', 10)
     there = '/sat2/camera/image_raw has a publisher'
-    client.until(lambda: f'/image: {there}' in client.health()[1])
-    assert client.health()[0] == b'\x01'
-    answer = client.call(Trigger, '/calibrator/calibrate')
+    vehicle.until(lambda: f'/image: {there}' in vehicle.health()[1])
+    assert vehicle.health()[0] == b'\x01'
+    answer = vehicle.call(Trigger, '/calibrator/calibrate')
     assert answer.message.startswith(
         f'no message on /observations: {there} and no subscriber; too'
     )
@@ -178,18 +161,16 @@ def test_a_driver_in_another_namespace_is_named(
 IMPLAUSIBLE = 'm/s is faster than any spacecraft: left out; send m/s'
 
 
-def test_velocities_of_no_spacecraft_are_counted_and_logged_once(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_velocities_of_no_spacecraft_are_counted_and_logged_once(vehicle: Vehicle) -> None:
     """
     NaN, inf and light speed were an error a message in the log, and OK in the diagnostics.
 
     A velocity that shows a usual mistake was taken without a word.
     """
-    observer = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    velocity = client.publisher(TwistStamped, '/spacecraft/velocity')
-    client.collect(StarObservations, 'observations')
-    client.until_listened()
+    observer = vehicle.start('star_observer', ros=REMAPS)
+    velocity = vehicle.publisher(TwistStamped, '/spacecraft/velocity')
+    vehicle.collect(StarObservations, 'observations')
+    vehicle.until_listened()
 
     def send(*speeds_m_s: float, x_m_s: float = 0.0, z_m_s: float = 0.0) -> None:
         for speed_m_s in speeds_m_s:
@@ -200,44 +181,42 @@ def test_velocities_of_no_spacecraft_are_counted_and_logged_once(
 
     send(7000.0)
     doubt = 'the velocity may be relative to the Earth: add the barycentric velocity of the Earth'
-    client.until(lambda: client.health()[:2] == (b'\x01', doubt))
-    client.until(lambda: doubt in observer.said())
+    vehicle.until(lambda: vehicle.health()[:2] == (b'\x01', doubt))
+    vehicle.until(lambda: doubt in observer.said())
     send(math.nan, math.inf, 3e8)
-    client.until_value('velocities_left_out', '3')
-    level, text, _ = client.health()
+    vehicle.until_value('velocities_left_out', '3')
+    level, text, _ = vehicle.health()
     assert level == b'\x01' and text == 'velocity [0.0, 300000000.0, 0.0] ' + IMPLAUSIBLE
     x_m_s, y_m_s, z_m_s = SPEED_OF_LIGHT_M_S * earth_velocity_c(0)  # at the stamp of all
     send(y_m_s, x_m_s=x_m_s, z_m_s=z_m_s)
-    client.until_value('messages', '5')
-    level, text, values = client.health()
+    vehicle.until_value('messages', '5')
+    level, text, values = vehicle.health()
     assert (level, text) == (b'\x00', 'waiting for images')
     assert (values['velocities_left_out'], values['callback_errors']) == ('3', '0')
-    client.until(lambda: observer.said().count(IMPLAUSIBLE) > 0)
+    vehicle.until(lambda: observer.said().count(IMPLAUSIBLE) > 0)
     assert observer.said().count(IMPLAUSIBLE) == observer.said().count(doubt) == 1
 
 
-def test_a_publisher_that_is_not_received_is_named(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_a_publisher_that_is_not_received_is_named(vehicle: Vehicle) -> None:
     """By its name on the graph: the image was asked for as reliable, the calibration latched."""
     fixed = 'qos_overrides.{}.subscription.reliability:={}'.format
     given = fixed(IMAGES, 'reliable'), fixed('/spacecraft/velocity', 'best_effort')
-    observer = start_node('star_observer', ros=(*parameters(tiny_bag, *given), *REMAPS))
-    image = client.node.create_publisher(Image, IMAGES, qos_profile_sensor_data)
+    observer = vehicle.start('star_observer', *given, ros=REMAPS)
+    image = vehicle.node.create_publisher(Image, IMAGES, qos_profile_sensor_data)
     refused = '/opnav/image_raw: Best effort publisher and reliable subscription'
-    client.until(lambda: client.health()[1] == f'not received: {refused}')
-    assert client.health()[0] == b'\x01'
+    vehicle.until(lambda: vehicle.health()[1] == f'not received: {refused}')
+    assert vehicle.health()[0] == b'\x01'
     assert refused in observer.said()
-    client.node.destroy_publisher(image)
+    vehicle.node.destroy_publisher(image)
     # What is fixed for one topic is no rule for the others.
-    shown = client.node.get_subscriptions_info_by_topic
+    shown = vehicle.node.get_subscriptions_info_by_topic
     for topic, fixed_to in ((ATTITUDES, 'RELIABLE'), ('/spacecraft/velocity', 'BEST_EFFORT')):
         assert [one.qos_profile.reliability.name for one in shown(topic)] == [fixed_to]
-    latched = client.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
+    latched = vehicle.node.create_publisher(Calibration, '/calibration', QoSProfile(depth=1))
     refused = '/calibration: Volatile publisher and transient local subscription'
-    client.until(lambda: client.health()[1] == f'not received: {refused}')
-    client.node.destroy_publisher(latched)
-    client.node.create_publisher(Twist, '/spacecraft/velocity', 10)
+    vehicle.until(lambda: vehicle.health()[1] == f'not received: {refused}')
+    vehicle.node.destroy_publisher(latched)
+    vehicle.node.create_publisher(Twist, '/spacecraft/velocity', 10)
     refused = '/spacecraft/velocity: a publisher sends geometry_msgs/msg/Twist, not '
     refused += 'geometry_msgs/msg/TwistStamped'
-    client.until(lambda: client.health()[1] == f'not received: {refused}')
+    vehicle.until(lambda: vehicle.health()[1] == f'not received: {refused}')

@@ -6,13 +6,12 @@ from __future__ import annotations
 import functools
 import importlib.util
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree
 
 from diagnostic_msgs.msg import DiagnosticArray
-from node_inputs import BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from vehicle import BOTH, Client, IMAGES, REMAPS, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import EnsembleStatus
 from starcal_ground.bag_writer import BagWriter
@@ -20,43 +19,36 @@ from starcal_ground.bags import reader
 from starcal_ros.formats.messages.message_codec import stamp_ns
 from starcal_ros.records import Image
 
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
 ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.nodes
-def test_a_bag_plays_again_by_its_clock(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_a_bag_plays_again_by_its_clock(vehicle: Vehicle) -> None:
     """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
-    given = parameters(tiny_bag, 'autostart:=true', 'use_sim_time:=true')
-    common = ('-r', '__ns:=/cam', *given, '--log-level', 'info')
-    start_node('star_observer', ros=(*common, '-r', '__node:=star_observer', *REMAPS))
-    start_node('calibrator', ros=(*common, '-r', '__node:=calibrator'))
-    client.until(lambda: client.node.count_subscribers('/cam/observations'))
-    status = client.latched(EnsembleStatus, '/cam/ensemble_status')
-    health = client.collect(DiagnosticArray, '/diagnostics')
+    for name in BOTH:
+        ros = ('-r', '__ns:=/cam', '-r', f'__node:={name}', *REMAPS, '--log-level', 'info')
+        vehicle.start(name, 'autostart:=true', 'use_sim_time:=true', ros=ros)
+    vehicle.until(lambda: vehicle.node.count_subscribers('/cam/observations'))
+    status = vehicle.latched(EnsembleStatus, '/cam/ensemble_status')
+    health = vehicle.collect(DiagnosticArray, '/diagnostics')
     # Simulated time without a /clock yet: diagnostics come all the same, and warn of it.
-    client.until(lambda: len({one.status[0].name for one in health if warns_of_clock(one)}) == 2)
-    player = ('-r', '__ns:=/cam', '-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0', '-p', 'loop:=true')
-    start_node('bag_player', ros=(*player, '-p', 'clock:=true'))
+    vehicle.until(lambda: len({one.status[0].name for one in health if warns_of_clock(one)}) == 2)
+    vehicle.start_player(vehicle.bag, 'loop:=true', 'clock:=true', ros=('-r', '__ns:=/cam'))
 
     def restarts() -> int:
         told = (one.status[0] for one in health if 'star_observer' in one.status[0].name)
         values = [int(v.value) for s in told for v in s.values if v.key == 'restarts']
         return max(values, default=0)
 
-    client.until(lambda: restarts() >= 1)
-    images = len(list(reader.read_images([tiny_bag], IMAGES)))
-    client.until(lambda: status and status[-1].images == images)
-    stamps = [raw.log_time_ns for raw in reader.read_raw([tiny_bag])]
+    vehicle.until(lambda: restarts() >= 1)
+    images = len(list(reader.read_images([vehicle.bag], IMAGES)))
+    vehicle.until(lambda: status and status[-1].images == images)
+    stamps = [raw.log_time_ns for raw in reader.read_raw([vehicle.bag])]
 
     def is_within_the_bag() -> bool:
         return min(stamps) <= stamp_ns(health[-1].header.stamp) <= max(stamps) + 10**9
 
-    client.until(is_within_the_bag)  # whatever pass: the diagnostics take the time from /clock
+    vehicle.until(is_within_the_bag)  # whatever pass: the diagnostics take the time from /clock
 
 
 def warns_of_clock(message: DiagnosticArray) -> bool:
@@ -65,20 +57,18 @@ def warns_of_clock(message: DiagnosticArray) -> bool:
 
 
 @pytest.mark.nodes
-def test_the_policies_name_what_the_nodes_have(
-    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
-) -> None:
+def test_the_policies_name_what_the_nodes_have(vehicle: Vehicle, tmp_path: Path) -> None:
     """Each security policy allows exactly the topics and services of its node."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_image('/image', Image(1, np.zeros((2, 2), np.uint8)), 'camera')
         writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')
         writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')
         writer.write_temperature('/temperature', 1, 20.0, 'camera')
-    start_node('bag_player', ros=('-p', f'bag:={tmp_path / "bag"}', '-p', 'clock:=true', *WAIT))
+    vehicle.start_player(tmp_path / 'bag', 'clock:=true', 'wait_for_subscribers_s:=100.0')
     for name in BOTH:
         # Nobody may listen to the player, or it plays and ends.
         remaps = ('-r', 'image:=/elsewhere') if name == 'star_observer' else ()
-        start_node(name, ros=(*parameters(tiny_bag), *remaps))
+        vehicle.start(name, ros=remaps)
     for name in (*BOTH, 'bag_player'):
         path = ROOT / 'config' / 'security' / f'{name}.policy.xml'
         profile = ElementTree.parse(path).getroot().find('enclaves/enclave/profiles/profile')
@@ -92,11 +82,8 @@ def test_the_policies_name_what_the_nodes_have(
         }
         if importlib.util.find_spec('tf2_msgs') is None:
             allowed -= {('publish', '/tf_static'), ('subscribe', '/tf_static')}
-        client.until(functools.partial(shows, client, name, allowed))
-        assert of_graph(client, name) == allowed, name
-
-
-WAIT = ('-p', 'wait_for_subscribers_s:=100.0')
+        vehicle.until(functools.partial(shows, vehicle, name, allowed))
+        assert of_graph(vehicle, name) == allowed, name
 
 
 def full_name(node: str, name: str) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 import random
 import subprocess
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from attacks import BAG, calibration, many, observations  # type: ignore[import-not-found]
 import cv2
@@ -19,7 +19,6 @@ from lifecycle_msgs.srv import ChangeState, GetState
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
 from node_campaign import Campaign  # type: ignore[import-not-found]
-from node_inputs import IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -28,6 +27,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
 from std_srvs.srv import Trigger
+from vehicle import Client, IMAGES, NodeProcess, REMAPS, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
@@ -40,25 +40,15 @@ from starcal_ros.formats.messages.record_messages import (
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
 
-if TYPE_CHECKING:
-    from conftest import Client, NodeProcess, StartNode
-
 pytestmark = [pytest.mark.nodes, pytest.mark.slow]
 
 # Fields that may be NaN or infinite by the interface document.
 MAY_BE_INFINITE = frozenset(
-    [
-        *(
-            'temperature_degc',
-            'star_tracker_rate_rad_s',
-            'star_tracker_rate_sigma_rad_s',
-            'velocity_sigma_m_s',
-            'zenith_icrf',
-            'predicted_sigma',
-        ),
-        *('attitude_gap_s', 'found', 'limit', 'shape_px', 'shape_p_value', 'rotation_arcsec'),
-        'p_value',
-    ]
+    (
+        *('temperature_degc', 'velocity_sigma_m_s', 'zenith_icrf', 'predicted_sigma', 'found'),
+        *('star_tracker_rate_rad_s', 'star_tracker_rate_sigma_rad_s', 'attitude_gap_s', 'limit'),
+        *('shape_px', 'shape_p_value', 'rotation_arcsec', 'p_value'),
+    )
 )
 SHUTDOWNS = (5, 6, 7)  # a node rightly executes it
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -150,39 +140,30 @@ def compressed_image() -> Any:
 @pytest.mark.parametrize(
     ('kind', 'template'), [(Image, small_image), (CompressedImage, compressed_image)]
 )
-def test_every_image_is_answered(
-    client: Client,
-    start_node: StartNode,
-    tiny_bag: Path,
-    kind: Any,
-    template: Callable[[], Any],
-) -> None:
-    given = parameters(tiny_bag, 'attitude_timeout_s:=0.0')
-    node = start_node('star_observer', ros=(*given, '-r', f'image:={IMAGES}'))
-    answers = client.collect(StarObservations, 'observations')
-    infos = client.collect(CameraInfo, 'image_camera_info')
-    client.until_listened()
-    images = client.publisher(kind, IMAGES)
+def test_every_image_is_answered(vehicle: Vehicle, kind: Any, template: Callable[[], Any]) -> None:
+    node = vehicle.start('star_observer', 'attitude_timeout_s:=0.0', ros=REMAPS)
+    answers = vehicle.collect(StarObservations, 'observations')
+    infos = vehicle.collect(CameraInfo, 'image_camera_info')
+    vehicle.until_listened()
+    images = vehicle.publisher(kind, IMAGES)
     for batch in batches(mutated(template(), 20), 20):  # as many as the queue holds
         before = len(answers)
         for message, _ in batch:
             images.publish(message)
-        client.until(lambda: len(answers) - before >= len(batch))  # noqa: B023
+        vehicle.until(lambda: len(answers) - before >= len(batch))  # noqa: B023
     assert_finite([*answers, *infos])
     # One that is cut off is counted with its reason, and the node goes on.
     counted = sum(answer.refusal == 'bad_layout' for answer in answers) + 1
     images.publish(serialize_message(template())[:40])
-    client.until(lambda: answers[-1].detail.startswith(f'{IMAGES}: 40 bytes are no'))
-    client.until_value('refused_bad_layout', str(counted))
+    vehicle.until(lambda: answers[-1].detail.startswith(f'{IMAGES}: 40 bytes are no'))
+    vehicle.until_value('refused_bad_layout', str(counted))
     assert node.process.poll() is None
 
 
-def test_the_star_observer_measures_images_after_hostile_messages(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    node = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    answers = client.collect(StarObservations, 'observations')
-    received = Received(client, 'star_observer')
+def test_the_star_observer_measures_images_after_hostile_messages(vehicle: Vehicle) -> None:
+    node = vehicle.start('star_observer', ros=REMAPS)
+    answers = vehicle.collect(StarObservations, 'observations')
+    received = Received(vehicle, 'star_observer')
     header = small_image().header
     attitude = attitude_to_message(10**18, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf', make_message)
     for kind, topic, template in (
@@ -190,57 +171,57 @@ def test_the_star_observer_measures_images_after_hostile_messages(
         (TwistStamped, '/spacecraft/velocity', TwistStamped(header=header)),
         (Temperature, 'temperature', Temperature(header=header)),
     ):
-        received.send(client.publisher(kind, topic), mutated(template, 20))
-    latched = client.publisher(Calibration, 'calibration', LATCHED)
+        received.send(vehicle.publisher(kind, topic), mutated(template, 20))
+    latched = vehicle.publisher(Calibration, 'calibration', LATCHED)
     sound = calibration_to_message(calibration(), make_message)
     received.send(latched, mutated(sound, 20), at_once=1)  # a latched topic holds one message
-    assert_common_requests_are_answered(client, 'star_observer', node)
+    assert_common_requests_are_answered(vehicle, 'star_observer', node)
     latched.publish(sound)
-    start_node('bag_player', ros=('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0'))
+    vehicle.start_player(vehicle.bag)
     images = len(list(reader.read_images([BAG], IMAGES)))
     # Stamps that went far ahead and come back cost the first images.
-    client.until(lambda: sum(not answer.refusal for answer in answers) >= images // 2)
+    vehicle.until(lambda: sum(not answer.refusal for answer in answers) >= images // 2)
     assert_finite(answers)
     assert node.process.poll() is None
 
 
 def test_the_calibrator_calibrates_after_hostile_messages(
-    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+    vehicle: Vehicle, tmp_path: Path
 ) -> None:
     """Those that pass for observations are saved as well."""
     state = f'state_dir:={tmp_path}/state'
-    node = start_node('calibrator', ros=parameters(tiny_bag, 'max_images:=30', state))
+    node = vehicle.start('calibrator', 'max_images:=30', state)
     published = [
-        client.statuses(),
-        *(client.latched(Calibration, t) for t in ('calibration', 'candidate_calibration')),
-        client.latched(CameraInfo, 'camera_info'),
-        client.latched(TransformStamped, 'alignment'),
+        vehicle.statuses(),
+        *(vehicle.latched(Calibration, t) for t in ('calibration', 'candidate_calibration')),
+        vehicle.latched(CameraInfo, 'camera_info'),
+        vehicle.latched(TransformStamped, 'alignment'),
     ]
-    received = Received(client, 'calibrator')
-    publisher = client.publisher(StarObservations, 'observations')
+    received = Received(vehicle, 'calibrator')
+    publisher = vehicle.publisher(StarObservations, 'observations')
     brightest = observations()[0]
     brightest = brightest.select(np.argsort(np.argsort(-brightest.flux_dn)) < 40)
     template = observations_to_message(brightest, 'camera', make_message)
     received.send(publisher, mutated(template, 60))
     statuses = published[0]
-    client.until(lambda: statuses and 0 < statuses[-1].images == statuses[-1].images_saved)
+    vehicle.until(lambda: statuses and 0 < statuses[-1].images == statuses[-1].images_saved)
     assert {entry.reason for entry in statuses[-1].refused} >= {'bad_observations'}
     request = Calibrate.Request(method='magic', estimate=['fx', 'fz'])
-    assert_requests_are_answered(client, Calibrate, '/calibrator/solve', request, node)
-    assert_common_requests_are_answered(client, 'calibrator', node)
-    client.call(Trigger, '/calibrator/reset')
-    client.until_images(0)
-    client.fill(observations())
-    assert client.call(Trigger, '/calibrator/calibrate').success
+    assert_requests_are_answered(vehicle, Calibrate, '/calibrator/solve', request, node)
+    assert_common_requests_are_answered(vehicle, 'calibrator', node)
+    vehicle.call(Trigger, '/calibrator/reset')
+    vehicle.until_images(0)
+    vehicle.fill(observations())
+    vehicle.calibrate()
     assert_finite(itertools.chain.from_iterable(published))
     assert node.process.poll() is None
 
 
 @pytest.fixture
-def filled(client: Client, start_node: StartNode, tiny_bag: Path) -> NodeProcess:
+def filled(vehicle: Vehicle) -> NodeProcess:
     """A calibrator with the images of the tiny bag."""
-    node = start_node('calibrator', ros=parameters(tiny_bag))
-    client.fill(observations())
+    node = vehicle.start('calibrator')
+    vehicle.fill(observations())
     return node
 
 
@@ -273,12 +254,10 @@ time.sleep(60)
 """
 
 
-def test_a_second_calibrator_is_warned_of(
-    client: Client, start_node: StartNode, tiny_bag: Path, filled: NodeProcess
-) -> None:
-    start_node('calibrator', ros=(*parameters(tiny_bag), '-r', '__node:=double'))
-    client.until(lambda: 'another node publishes' in client.health('calibrator')[1])
-    assert client.call(Trigger, '/calibrator/calibrate').success
+def test_a_second_calibrator_is_warned_of(vehicle: Vehicle, filled: NodeProcess) -> None:
+    vehicle.start('calibrator', ros=('-r', '__node:=double'))
+    vehicle.until(lambda: 'another node publishes' in vehicle.health('calibrator')[1])
+    vehicle.calibrate()
 
 
 def test_calls_to_a_node_that_is_deactivated_are_answered(

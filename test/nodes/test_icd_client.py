@@ -11,23 +11,19 @@ import array
 from collections.abc import Iterator
 import json
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped, TransformStamped
-from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from rosbags import highlevel as rosbags
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
-from std_srvs.srv import Trigger
+from vehicle import BOTH, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -56,26 +52,26 @@ def bag_messages(folder: Path) -> Iterator[Any]:
             yield made
 
 
-def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+def test_calibrates_through_the_icd(vehicle: Vehicle) -> None:
     """Images and attitudes give the true camera, also to late subscribers."""
     for name in BOTH:
-        start_node(name, ros=parameters(tiny_bag))
-    early = client.latched(CameraInfo, 'camera_info')
-    observations: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, 'image', 20)
-    attitudes = client.publisher(QuaternionStamped, 'attitude')
-    client.until_listened(listeners=2)
+        vehicle.start(name)
+    early = vehicle.latched(CameraInfo, 'camera_info')
+    observations: list[Any] = vehicle.collect(StarObservations, 'observations')
+    images = vehicle.publisher(Image, 'image', 20)
+    attitudes = vehicle.publisher(QuaternionStamped, 'attitude')
+    vehicle.until_listened(listeners=2)
 
     sent = 0
-    for message in bag_messages(tiny_bag):
+    for message in bag_messages(vehicle.bag):
         if isinstance(message, Image):
             # An observer works at its own speed: two images ahead are enough.
-            client.until(lambda enough=sent - 2: len(observations) >= enough)
+            vehicle.until(lambda enough=sent - 2: len(observations) >= enough)
             images.publish(message)
             sent += 1
         else:
             attitudes.publish(message)
-    client.until(lambda: len(observations) == sent)
+    vehicle.until(lambda: len(observations) == sent)
     assert [o.refusal for o in observations] == [''] * sent
     for one in observations:
         n = len(one.catalog_id)
@@ -88,27 +84,26 @@ def test_calibrates_through_the_icd(client: Client, start_node: StartNode, tiny_
             < 1e-12
         )
 
-    status = client.until_images(sent)
+    status = vehicle.until_images(sent)
     assert sum(status.coverage) == status.stars == sum(len(o.snr) for o in observations)
     assert len(status.coverage) == status.coverage_rows * status.coverage_cols
     assert len(status.predicted_sigma) == len(status.parameter_names)
 
-    trial = client.call(Calibrate, '/calibrator/solve', dry_run=True)
+    trial = vehicle.call(Calibrate, '/calibrator/solve', dry_run=True)
     assert trial.success, trial.message
     assert trial.calibration.stars_used > 0
     assert not any(info.k.any() for info in early), 'before one is active, none is calibrated'
 
-    answer = client.call(Trigger, '/calibrator/calibrate')
-    assert answer.success, answer.message
-    infos = client.latched(CameraInfo, 'camera_info')
-    alignments = client.latched(TransformStamped, 'alignment')
-    calibrations = client.latched(Calibration, 'calibration')
-    client.until(lambda: infos and alignments and calibrations and early[-1].k[0])
-    check_products(infos[0], alignments[0], calibrations[0], tiny_bag)
+    vehicle.calibrate()
+    infos = vehicle.latched(CameraInfo, 'camera_info')
+    alignments = vehicle.latched(TransformStamped, 'alignment')
+    calibrations = vehicle.latched(Calibration, 'calibration')
+    vehicle.until(lambda: infos and alignments and calibrations and early[-1].k[0])
+    check_products(infos[0], alignments[0], calibrations[0], vehicle.bag)
 
-    diagnostics = client.collect(DiagnosticArray, '/diagnostics')
+    diagnostics = vehicle.collect(DiagnosticArray, '/diagnostics')
     names = {f'starcal: {name}' for name in BOTH}
-    client.until(lambda: names <= {m.status[0].name for m in diagnostics})
+    vehicle.until(lambda: names <= {m.status[0].name for m in diagnostics})
     assert {m.status[0].level for m in diagnostics} == {b'\x00'}
 
 

@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from attacks import observations  # type: ignore[import-not-found]
-from calibrators import Calibrators, kept  # type: ignore[import-not-found]
+from calibrators import Calibrators, kept, scripts  # type: ignore[import-not-found]
 from kept_state import activation  # type: ignore[import-not-found]
 import pytest
 
@@ -31,133 +31,76 @@ def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cal
     made.close_all()
 
 
-# What P1 holds after the steps: images, and calibrations from the active one back in time.
-JOINS = {
-    # A disk fails, and another one takes its place.
-    'full A, B': ('open A; full; images 0 1 2; activate a; close; room; open B', '0 1 2', 'a'),
-    'full A, full B': ('open A; full; images 0 1; activate a; open B; room', '0 1', 'a'),
-    'A, full A, A': (
-        'open A; images 0; activate a; full; images 1; activate b; close; room; open A',
-        '0 1',
-        'b a',
-    ),
-    'A, full A, B': (
-        'open A; images 0; activate a; full; images 1; activate b; close; room; open B',
-        '0 1',
-        'b a',
-    ),
-    'A, full A, memory, B': (
-        'open A; images 0; full; images 1; activate a; open -; images 2; room; open B',
-        '0 1 2',
-        'a',
-    ),
-    # With and without a folder.
-    'memory, A': ('open -; images 0 1; activate m; open A', '0 1', 'm'),
-    'A, memory, A': (
-        'open A; images 0; activate a; open -; images 1; activate m; open A',
-        '0 1',
-        'm a',
-    ),
-    'A, B, A': (
-        'open A; images 0; activate a; open B; images 1; activate b; open A; images 2',
-        '0 1 2',
-        'b a',
-    ),
-    'A, memory, B, A': (
-        'open A; images 0; open -; images 1; activate m; open B; activate b; open A',
-        '0 1',
-        'b m',
-    ),
-    # A folder with records of its own: the later activation is active.
-    'earlier A and memory': (
-        ('P2 open A; P2 images 0 1; P2 activate a; P2 close; '
-         'open -; images 1 2; activate m; open A'),
-        '0 1 2',
-        'm a',
-    ),
-    'later A and memory': (
-        ('open -; images 0 1; activate m; '
-         'P2 open A; P2 images 1 2; P2 activate a; P2 close; open A'),
-        '1 2 0',
-        'a m',
-    ),
-    'between the events of A': (
-        ('P2 open A; P2 activate a; open -; activate m; P2 activate b; P2 rollback; P2 close; '
-         'open A'),
-        '',
-        'a',
-    ),
-    'A between the events of memory': (
-        'open -; activate m; P2 open A; P2 activate a; P2 close; activate n; open A',
-        '',
-        'n m',
-    ),
-    'a copy of A': (
-        'open A; images 0 1; activate a; activate b; close; copy A B; open B; images 2; open A',
-        '0 1 2',
-        'b a',
-    ),
-    'A and its copy went on': (
-        ('P2 open A; P2 images 0; P2 activate a; P2 close; copy A B; '
-         'P2 open A; P2 images 1; P2 activate b; P2 close; open B; images 2; activate c; open A'),
-        '0 1 2',
-        'c a',
-    ),
-    # Files of the folder are gone or damaged: the memory has their records.
-    'damaged image': ('open A; images 0 1; close; cut A/ensemble/*1.mcap; open A', '1 0', ''),
-    'damaged event': (
-        'open A; activate a; activate b; close; cut A/calibrations/*2.json; open A',
-        '',
-        'b a',
-    ),
-    'removed folder': ('open A; images 0 1; activate a; close; remove A; open A', '0 1', 'a'),
-    'reset': ('open A; images 0 1; reset; images 3', '3', ''),
-    # A reset is an event of the images: they do not come back from anywhere.
-    'reset on full A, A': (
-        'open A; images 0 1; activate a; full; reset; images 2; close; room; open A',
-        '2',
-        'a',
-    ),
-    'reset on full A, B': ('open A; images 0 1; full; reset; images 2; room; open B', '2', ''),
-    'reset on full A, B, A': (
-        'open A; images 0 1; full; reset; images 2; close; room; open B; open A',
-        '2',
-        '',
-    ),
-    'reset on A that cannot be emptied, A': (
-        ('open A; images 0 1; activate a; touch A/ensemble.emptied; reset; images 2; close; '
-         'remove A/ensemble.emptied; open A'),
-        '2',
-        'a',
-    ),
-    'reset in memory, A': ('open A; images 0 1; open -; reset; images 2; open A', '2', ''),
-    'reset in B, A': ('open A; images 0 1; open B; reset; open A', '', ''),
-    'reset in B, restart, B, A': (
-        'open A; images 0 1; open B; reset; kill; open B; open A',
-        '',
-        '',
-    ),
-    'reset in memory, B of another': (
-        'P2 open B; P2 images 0 1; P2 close; open -; images 2; reset; images 3; open B',
-        '0 1 3',
-        '',
-    ),
-    'reset of A by another': (
-        'open A; images 0 1; close; P2 open A; P2 reset; P2 images 2; P2 close; open A',
-        '2',
-        '',
-    ),
-    'images of a reset come again': (
-        'open A; images 0 1; full; reset; images 1 0 2; close; room; open A',
-        '1 0 2',
-        '',
-    ),
-    'images of a reset come again to A': (
-        'open A; images 0 1; open B; reset; P2 open A; P2 reset; P2 images 0; P2 close; open A',
-        '0',
-        '',
-    ),
-}  # fmt: skip
+# What P1 holds after steps: images | calibrations, from the active one back in time.
+JOINS = scripts("""
+# A disk fails, and another one takes its place.
+full A, B -> 0 1 2 | a
+    open A; full; images 0 1 2; activate a; close; room; open B
+full A, full B -> 0 1 | a
+    open A; full; images 0 1; activate a; open B; room
+A, full A, A -> 0 1 | b a
+    open A; images 0; activate a; full; images 1; activate b; close; room; open A
+A, full A, B -> 0 1 | b a
+    open A; images 0; activate a; full; images 1; activate b; close; room; open B
+A, full A, memory, B -> 0 1 2 | a
+    open A; images 0; full; images 1; activate a; open -; images 2; room; open B
+# With and without a folder.
+memory, A -> 0 1 | m
+    open -; images 0 1; activate m; open A
+A, memory, A -> 0 1 | m a
+    open A; images 0; activate a; open -; images 1; activate m; open A
+A, B, A -> 0 1 2 | b a
+    open A; images 0; activate a; open B; images 1; activate b; open A; images 2
+A, memory, B, A -> 0 1 | b m
+    open A; images 0; open -; images 1; activate m; open B; activate b; open A
+# A folder with records of its own: the later activation is active.
+earlier A and memory -> 0 1 2 | m a
+    P2 open A; P2 images 0 1; P2 activate a; P2 close; open -; images 1 2; activate m; open A
+later A and memory -> 1 2 0 | a m
+    open -; images 0 1; activate m; P2 open A; P2 images 1 2; P2 activate a; P2 close; open A
+between the events of A -> none | a
+    P2 open A; P2 activate a; open -; activate m; P2 activate b; P2 rollback; P2 close; open A
+A between the events of memory -> none | n m
+    open -; activate m; P2 open A; P2 activate a; P2 close; activate n; open A
+a copy of A -> 0 1 2 | b a
+    open A; images 0 1; activate a; activate b; close; copy A B; open B; images 2; open A
+A and its copy went on -> 0 1 2 | c a
+    P2 open A; P2 images 0; P2 activate a; P2 close; copy A B; P2 open A; P2 images 1;
+    P2 activate b; P2 close; open B; images 2; activate c; open A
+# Files of the folder are gone or damaged: the memory has their records.
+damaged image -> 1 0 | none
+    open A; images 0 1; close; cut A/ensemble/*1.mcap; open A
+damaged event -> none | b a
+    open A; activate a; activate b; close; cut A/calibrations/*2.json; open A
+removed folder -> 0 1 | a
+    open A; images 0 1; activate a; close; remove A; open A
+reset -> 3 | none
+    open A; images 0 1; reset; images 3
+# A reset is an event of the images: they do not come back from anywhere.
+reset on full A, A -> 2 | a
+    open A; images 0 1; activate a; full; reset; images 2; close; room; open A
+reset on full A, B -> 2 | none
+    open A; images 0 1; full; reset; images 2; room; open B
+reset on full A, B, A -> 2 | none
+    open A; images 0 1; full; reset; images 2; close; room; open B; open A
+reset on A that cannot be emptied, A -> 2 | a
+    open A; images 0 1; activate a; touch A/ensemble.emptied; reset; images 2; close;
+    remove A/ensemble.emptied; open A
+reset in memory, A -> 2 | none
+    open A; images 0 1; open -; reset; images 2; open A
+reset in B, A -> none | none
+    open A; images 0 1; open B; reset; open A
+reset in B, restart, B, A -> none | none
+    open A; images 0 1; open B; reset; kill; open B; open A
+reset in memory, B of another -> 0 1 3 | none
+    P2 open B; P2 images 0 1; P2 close; open -; images 2; reset; images 3; open B
+reset of A by another -> 2 | none
+    open A; images 0 1; close; P2 open A; P2 reset; P2 images 2; P2 close; open A
+images of a reset come again -> 1 0 2 | none
+    open A; images 0 1; full; reset; images 1 0 2; close; room; open A
+images of a reset come again to A -> 0 | none
+    open A; images 0 1; open B; reset; P2 open A; P2 reset; P2 images 0; P2 close; open A
+""")
 
 
 @pytest.mark.parametrize('name', JOINS)

@@ -8,12 +8,13 @@ import signal
 import subprocess
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sample_records import calibration, observations, status  # type: ignore[import-not-found]
+from vehicle import Client, StartNode  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.ros.monitor_client import Monitor
@@ -23,9 +24,6 @@ from starcal_ros.formats.messages.record_messages import (
     status_to_message,
 )
 from starcal_ros.ros.node import make_message
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -129,7 +127,7 @@ def test_a_bad_remap_is_answered_without_a_traceback(
 ) -> None:
     """The last line is ours, after those that rcl logs; one ends with its own interpreter."""
     module, is_forked = f'starcal_ground.ros.{client_name}', remap != ':='
-    process = start_node(module, ros=('-r', remap), forked=is_forked)
+    process = start_node(module, '-r', remap, forked=is_forked)
     assert process.wait() == 2 and 'Traceback' not in process.said(), process.said()
     last = process.said().splitlines()[-1]
     assert last.startswith(f'{client_name.removesuffix("_client")}') and remap in last

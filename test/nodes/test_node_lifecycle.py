@@ -11,20 +11,17 @@ import subprocess
 import sys
 import threading
 import time
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager, NO_TRANSITION  # type: ignore[import-not-found]
-from node_inputs import BOTH, parameters  # type: ignore[import-not-found]
 import pytest
 import rclpy
 from std_msgs.msg import Empty
+from vehicle import BOTH, Client, parameters, Vehicle  # type: ignore[import-not-found]
 
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import Executor
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -62,17 +59,17 @@ def try_everything(manager: Manager, state: str) -> None:
 
 @pytest.mark.parametrize('shut_down', [False, True])
 @pytest.mark.parametrize('state', PATHS)
-def test_every_transition_in_every_state(
-    client: Client, start_node: StartNode, tiny_bag: Path, state: str, shut_down: bool
-) -> None:
+def test_every_transition_in_every_state(vehicle: Vehicle, state: str, shut_down: bool) -> None:
     """Each node survives all transitions, and a signal ends it with status 0 in every state."""
-    ros = parameters(tiny_bag, 'autostart:=false')
     # What is shut down ends as finalized, whatever it was: one interpreter of its own shows that.
-    nodes = [start_node(name, ros=ros, forked=shut_down and state != 'active') for name in BOTH]
+    nodes = [
+        vehicle.start(name, 'autostart:=false', forked=shut_down and state != 'active')
+        for name in BOTH
+    ]
     # Each state meets both signals; the two nodes end by the same code.
     signals = [signal.SIGINT, signal.SIGTERM]
     for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
-        manager = Manager(client, node.name)
+        manager = Manager(vehicle, node.name)
         assert all(manager.change(step) for step in PATHS[state])
         if shut_down:
             assert manager.change(SHUTDOWN[state])
@@ -317,14 +314,12 @@ def test_threads_share_one_arena_of_memory() -> None:
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_nodes_end_after_several_signals(
-    client: Client, start_node: StartNode, tiny_bag: Path, seed: int
-) -> None:
+def test_nodes_end_after_several_signals(vehicle: Vehicle, seed: int) -> None:
     """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
     rng = random.Random(seed)
-    nodes = [start_node(name, ros=parameters(tiny_bag), forked=False) for name in BOTH]
-    managers = [Manager(client, node.name) for node in nodes]
-    client.until(lambda: all(manager.state() == 'active' for manager in managers))
+    nodes = [vehicle.start(name, forked=False) for name in BOTH]
+    managers = [Manager(vehicle, node.name) for node in nodes]
+    vehicle.until(lambda: all(manager.state() == 'active' for manager in managers))
     for _ in range(rng.choice([2, 3])):
         for node in nodes:
             node.send(rng.choice([signal.SIGINT, signal.SIGINT, signal.SIGTERM]))

@@ -14,7 +14,6 @@ from typing import Any, TYPE_CHECKING
 
 from geometry_msgs.msg import QuaternionStamped
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
-from node_inputs import ATTITUDES, BOTH, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
@@ -22,6 +21,17 @@ from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, Imu, Temperature
 from std_srvs.srv import Trigger
+from vehicle import (  # type: ignore[import-not-found]
+    ATTITUDES,
+    BOTH,
+    Client,
+    IMAGES,
+    parameters,
+    REMAPS,
+    StartNode,
+    tiny_observations,
+    Vehicle,
+)
 import yaml
 
 from starcal.msg import Calibration, StarObservations
@@ -55,10 +65,7 @@ from starcal_ros.records import refused_image
 from starcal_ros.ros.node import make_message
 
 if TYPE_CHECKING:
-    from conftest import Client, StartNode
-
     from starcal_ros.records import Calibration as CalibrationRecord
-    from starcal_ros.records import Ensemble
 
 pytestmark = pytest.mark.nodes
 
@@ -77,25 +84,17 @@ def attitude(stamp_ns: int) -> Any:
     return attitude_to_message(stamp_ns, np.array([0, 0, 0, 1.0]), '', make_message)
 
 
-def play(start_node: StartNode, folder: Path, *more: str) -> None:
-    """Play a bag at full speed to its end."""
-    player = start_node('bag_player', ros=('-p', f'bag:={folder}', '-p', 'rate:=0', *more))
-    assert player.wait() == 0, player.said()
-
-
-def test_nodes_and_tool_give_the_same_calibration(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_products: Path
-) -> None:
+def test_nodes_and_tool_give_the_same_calibration(vehicle: Vehicle, tiny_products: Path) -> None:
     """The observations have rates and the sigma of the velocity, the picture the image's size."""
     for name in BOTH:
-        start_node(name, ros=(*parameters(tiny_bag), *REMAPS))
-    pictures = client.collect(Image, 'annotated_image', 5)
-    answers: list[Any] = client.collect(StarObservations, 'observations')
+        vehicle.start(name, ros=REMAPS)
+    pictures = vehicle.collect(Image, 'annotated_image', 5)
+    answers: list[Any] = vehicle.collect(StarObservations, 'observations')
     # The player waits for the observer; calibrator and client must not miss the first image.
-    client.until_listened(listeners=2)
-    play(start_node, tiny_bag)
-    client.until_images(json.loads((tiny_bag / 'truth.json').read_text())['images'])
-    client.until(lambda: pictures and len(answers) == 10)
+    vehicle.until_listened(listeners=2)
+    vehicle.play(vehicle.bag)
+    vehicle.until_images(json.loads((vehicle.bag / 'truth.json').read_text())['images'])
+    vehicle.until(lambda: pictures and len(answers) == 10)
     assert {answer.velocity_sigma_m_s for answer in answers} == {10.0}
     rates_rad_s = np.array([answer.star_tracker_rate_rad_s for answer in answers])
     # The camera is still.
@@ -105,10 +104,8 @@ def test_nodes_and_tool_give_the_same_calibration(
     assert (picture.height, picture.width) == (answers[0].height, answers[0].width)
     assert len(picture.data) == picture.height * picture.width * 3
     assert np.ptp(np.frombuffer(picture.data, np.uint8)) > 100
-    answer = client.call(Trigger, '/calibrator/calibrate')
-    assert answer.success, answer.message
-    found = client.latched(Calibration, 'calibration')
-    client.until(lambda: found)
+    vehicle.calibrate()
+    found = vehicle.until_latched(Calibration, 'calibration')
     live = calibration_from_message(found[0])
     offline = read_calibration(tiny_products / CALIBRATION_FILE)
     # On a busy machine the velocity after an image may come too late: the one before it, of half a
@@ -130,7 +127,7 @@ def test_nodes_and_tool_give_the_same_calibration(
 
 
 def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool(
-    client: Client, start_node: StartNode, tmp_path: Path
+    vehicle: Vehicle, tmp_path: Path
 ) -> None:
     """The observer measures the images that matched no star again with the first calibration."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
@@ -139,15 +136,14 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
     given = ('--params', str(bag / 'params.yaml'), '--no-report')
     assert main(['calibrate', str(bag), *given, '-o', str(out)]) == 0
     for name in BOTH:
-        start_node(name, ros=(*parameters(bag), *REMAPS))
-    client.until_listened()
-    play(start_node, bag)
-    found = client.latched(Calibration, 'calibration')
+        vehicle.start_node(name, *parameters(bag), *REMAPS)
+    vehicle.until_listened()
+    vehicle.play(bag)
+    found = vehicle.latched(Calibration, 'calibration')
     for images in (8, 10):
-        client.until_images(images)
-        answer = client.call(Trigger, '/calibrator/calibrate')
-        assert answer.success, answer.message
-        client.until(lambda images=images: found and found[-1].images_used == images)
+        vehicle.until_images(images)
+        vehicle.calibrate()
+        vehicle.until(lambda images=images: found and found[-1].images_used == images)
     live = calibration_from_message(found[-1])
     offline = read_calibration(out / CALIBRATION_FILE)
     off = live.geometry.camera.parameters - offline.geometry.camera.parameters
@@ -156,37 +152,30 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
     np.testing.assert_allclose(live.sigma, offline.sigma, rtol=1e-4)
 
 
-def test_each_service_of_a_calibrator(
-    client: Client,
-    start_node: StartNode,
-    tiny_bag: Path,
-    tiny_observations: Ensemble,
-    tmp_path: Path,
-) -> None:
+def test_each_service_of_a_calibrator(vehicle: Vehicle, tmp_path: Path) -> None:
     """Dry runs, bad requests, a table, roll-back, reset: one calibration is ever published."""
-    start_node('calibrator', ros=parameters(tiny_bag))
+    vehicle.start('calibrator')
     # A call that changes nothing: if its answer is lost, it is called again.
-    none = client.call(Trigger, '/calibrator/rollback')
+    none = vehicle.call(Trigger, '/calibrator/rollback')
     assert not none.success and none.message == 'no calibration is active'
-    client.fill(tiny_observations.images)
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    published: list[Any] = client.latched(Calibration, 'calibration')
-    client.until(lambda: published)
+    vehicle.fill(tiny_observations().images)
+    vehicle.calibrate()
+    published: list[Any] = vehicle.until_latched(Calibration, 'calibration')
     # All but k3, which is zero in truth: the gate would name any other that is held.
     names = ['fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2']
-    trial = client.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=names)
+    trial = vehicle.call(Calibrate, '/calibrator/solve', dry_run=True, estimate=names)
     assert trial.success and 'would be activated' in trial.message, trial.message
     assert list(trial.calibration.estimated) == names
-    bad = client.call(Calibrate, '/calibrator/solve', estimate=['fz'])
+    bad = vehicle.call(Calibrate, '/calibrator/solve', estimate=['fz'])
     assert not bad.success and 'fz' in bad.message
     assert bad.calibration.stars_used == 0
-    bad = client.call(Calibrate, '/calibrator/solve', method='magic')
+    bad = vehicle.call(Calibrate, '/calibrator/solve', method='magic')
     assert not bad.success and 'magic' in bad.message
     for estimate in (['fx'] * 100_000, ['fx', 'fx'], ['x' * 10**6]):
-        bad = client.call(Calibrate, '/calibrator/solve', estimate=estimate)
+        bad = vehicle.call(Calibrate, '/calibrator/solve', estimate=estimate)
         assert not bad.success and len(bad.message) <= 200
 
-    answer = client.call(LineOfSightTable, '/calibrator/lookup', points=7)
+    answer = vehicle.call(LineOfSightTable, '/calibrator/lookup', points=7)
     assert answer.success and '49 lines of sight' in answer.message
     active = calibration_from_message(published[0])
     write_calibration(active, tmp_path / 'calibration.json')
@@ -200,124 +189,112 @@ def test_each_service_of_a_calibrator(
     budget = active.sigma_budget
     assert [part.cause for part in answer.sigma_budget] == [part.cause for part in budget]
     assert answer.sigma_budget[0].map_arcsec == budget[0].map_arcsec > 0.0
-    default = client.call(LineOfSightTable, '/calibrator/lookup')
+    default = vehicle.call(LineOfSightTable, '/calibrator/lookup')
     assert len(default.u_px) == 25**2
     for points in (1, 201, 2**32 - 1):
-        refused = client.call(LineOfSightTable, '/calibrator/lookup', points=points)
+        refused = vehicle.call(LineOfSightTable, '/calibrator/lookup', points=points)
         assert not refused.success and f'points: {points}' in refused.message
 
-    reset = client.call(Trigger, '/calibrator/reset')
-    dropped = f'{len(tiny_observations.images)} images dropped'
+    reset = vehicle.call(Trigger, '/calibrator/reset')
+    dropped = f'{len(tiny_observations().images)} images dropped'
     assert reset.success and reset.message.startswith(dropped)
-    client.until_images(0)
-    assert not client.call(Trigger, '/calibrator/calibrate').success
+    vehicle.until_images(0)
+    assert not vehicle.call(Trigger, '/calibrator/calibrate').success
     assert len(published) == 1
-    client.fill(tiny_observations.images)
-    assert client.call(Trigger, '/calibrator/calibrate').success
-    back = client.call(Trigger, '/calibrator/rollback')
+    vehicle.fill(tiny_observations().images)
+    vehicle.calibrate()
+    back = vehicle.call(Trigger, '/calibrator/rollback')
     assert back.success and 'activated again' in back.message
-    none = client.call(Trigger, '/calibrator/rollback')
+    none = vehicle.call(Trigger, '/calibrator/rollback')
     assert not none.success and 'no calibration before' in none.message
 
 
-def test_gate_refusal_and_force(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
-) -> None:
+def test_gate_refusal_and_force(vehicle: Vehicle) -> None:
     """A refused candidate is only in the response, unless it is forced."""
-    calibrator = start_node('calibrator', ros=parameters(tiny_bag, 'max_change_px:=1e-6'))
-    client.fill(tiny_observations.images)
-    found = client.latched(Calibration, 'calibration')
-    client.until(lambda: found)
-    answer = client.call(Trigger, '/calibrator/calibrate')
+    calibrator = vehicle.start_filled('max_change_px:=1e-6')
+    found = vehicle.until_latched(Calibration, 'calibration')
+    answer = vehicle.call(Trigger, '/calibrator/calibrate')
     assert not answer.success and answer.message.startswith('refused by the gate')
-    solved = client.call(Calibrate, '/calibrator/solve')
+    solved = vehicle.call(Calibrate, '/calibrator/solve')
     assert not solved.success and solved.calibration.stars_used > 0
     assert solved.calibration.reasons and not solved.calibration.accepted
-    client.until(lambda: 'refused by the gate' in client.health('calibrator')[1])
+    vehicle.until(lambda: 'refused by the gate' in vehicle.health('calibrator')[1])
     assert [one.number for one in found] == [0]  # that none is active
-    candidate = client.latched(Calibration, 'candidate_calibration')
-    client.until(lambda: candidate)
+    candidate = vehicle.until_latched(Calibration, 'candidate_calibration')
     assert candidate[0].reasons and candidate[0].number == 0
-    forced = client.call(Calibrate, '/calibrator/solve', force=True)
+    forced = vehicle.call(Calibrate, '/calibrator/solve', force=True)
     assert forced.success and not forced.calibration.accepted
-    client.until(lambda: found[1:])
+    vehicle.until(lambda: found[1:])
     assert found[1].reasons[-1] == 'activated by request despite the gate'
     assert found[1].forced and found[1].number == 1
-    client.until(lambda: 'active despite the gate' in client.health('calibrator')[1])
+    vehicle.until(lambda: 'active despite the gate' in vehicle.health('calibrator')[1])
     assert calibrator.process.poll() is None
 
 
-def test_an_image_waits_for_its_attitude_and_has_the_temperature(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle: Vehicle) -> None:
     """The attitudes are those of an Imu, which the node takes by the type of their publisher."""
-    given = parameters(tiny_bag, 'attitude_timeout_s:=60.0')
-    start_node('star_observer', ros=(*given, *REMAPS, '-r', 'temperature:=/box'))
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, IMAGES, 10)
-    attitudes = client.publisher(Imu, ATTITUDES)
-    temperatures = client.publisher(Temperature, '/box')
-    first = next(reader.read_raw([tiny_bag], [IMAGES]))
+    ros = (*REMAPS, '-r', 'temperature:=/box')
+    vehicle.start('star_observer', 'attitude_timeout_s:=60.0', ros=ros)
+    answers: list[Any] = vehicle.collect(StarObservations, 'observations')
+    images = vehicle.publisher(Image, IMAGES, 10)
+    attitudes = vehicle.publisher(Imu, ATTITUDES)
+    temperatures = vehicle.publisher(Temperature, '/box')
+    first = next(reader.read_raw([vehicle.bag], [IMAGES]))
     for offset_ns, degc in ((-2 * 10**9, 3.5), (-(10**9), -7.25), (10**9, 40.0)):
         message = temperature_to_message(
             first.log_time_ns + offset_ns, degc, 'camera', make_message
         )
         temperatures.publish(message)
     assert temperatures.wait_for_all_acked()
-    client.until_listened()
+    vehicle.until_listened()
     images.publish(first.data)
-    client.until_value('images_waiting', '1')
+    vehicle.until_value('images_waiting', '1')
     assert not answers
-    for raw in reader.read_raw([tiny_bag], [ATTITUDES]):
+    for raw in reader.read_raw([vehicle.bag], [ATTITUDES]):
         decoded, sample = reader.decode(raw), Imu()
         sample.header = make_header(raw.log_time_ns, 'icrf', make_message)
         for axis in 'xyzw':
             setattr(sample.orientation, axis, getattr(decoded.quaternion, axis))
         attitudes.publish(sample)
-    client.until(lambda: answers)
+    vehicle.until(lambda: answers)
     assert answers[0].refusal == '' and len(answers[0].catalog_id) > 50
     assert answers[0].temperature_degc == -7.25
 
 
-def test_overrun_is_answered(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+def test_overrun_is_answered(vehicle: Vehicle) -> None:
     """With more images than the queue holds, each is answered, the surplus with overrun."""
-    start_node('star_observer', ros=parameters(tiny_bag, 'attitude_timeout_s:=60.0'))
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, 'image', 50)
-    attitudes = client.publisher(QuaternionStamped, 'attitude')
-    client.until_listened()
+    vehicle.start('star_observer', 'attitude_timeout_s:=60.0')
+    answers: list[Any] = vehicle.collect(StarObservations, 'observations')
+    images = vehicle.publisher(Image, 'image', 50)
+    attitudes = vehicle.publisher(QuaternionStamped, 'attitude')
+    vehicle.until_listened()
     for first, end in ((1, 20), (21, 30), (31, 40)):
         for k in range(first, end + 1):
             images.publish(blank(k))
         # DDS itself keeps no more than twenty: these are taken before the next are sent.
-        client.until_value('images_waiting', str(end))
+        vehicle.until_value('images_waiting', str(end))
     attitudes.publish(attitude(100_000_000_000))
-    client.until(lambda: len(answers) == 40)
+    vehicle.until(lambda: len(answers) == 40)
     assert [a.refusal for a in answers] == ['wrong_size'] * 20 + ['overrun'] * 20
 
 
-def test_camera_info_per_image(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
-) -> None:
+def test_camera_info_per_image(vehicle: Vehicle) -> None:
     """The active calibration with the header of each image; never the prior or a candidate."""
-    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
-    setup = load_setup({**values, 'camera_info_url': str(tiny_bag / 'camera.yaml')})
-    active = solving.solve(tiny_observations, setup)
+    values = yaml.safe_load((vehicle.bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    setup = load_setup({**values, 'camera_info_url': str(vehicle.bag / 'camera.yaml')})
+    active = solving.solve(tiny_observations(), setup)
     assert active.accepted
     candidate = dataclasses.replace(active, accepted=False, reasons=('bad',))
-    observer = start_node(
-        'star_observer',
-        ros=parameters(tiny_bag, 'attitude_timeout_s:=0.0'),
-    )
+    observer = vehicle.start('star_observer', 'attitude_timeout_s:=0.0')
     best_effort = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-    lossy = client.collect(CameraInfo, 'image_camera_info', best_effort)
-    infos: list[Any] = client.collect(CameraInfo, 'image_camera_info')
-    answers: list[Any] = client.collect(StarObservations, 'observations')
-    images = client.publisher(Image, 'image', 50)
+    lossy = vehicle.collect(CameraInfo, 'image_camera_info', best_effort)
+    infos: list[Any] = vehicle.collect(CameraInfo, 'image_camera_info')
+    answers: list[Any] = vehicle.collect(StarObservations, 'observations')
+    images = vehicle.publisher(Image, 'image', 50)
     latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    calibrations = client.node.create_publisher(Calibration, 'calibration', latched)
+    calibrations = vehicle.node.create_publisher(Calibration, 'calibration', latched)
     camera = setup.prior.camera
-    client.until_listened()
+    vehicle.until_listened()
 
     def show(stamp_ns: int, frame_id: str = 'opnav', **size: int) -> Any:
         message = blank(stamp_ns, **{'width': camera.width, 'height': camera.height, **size})
@@ -327,15 +304,15 @@ def test_camera_info_per_image(
 
     def publish(calibration: CalibrationRecord, said: str) -> None:
         calibrations.publish(calibration_to_message(calibration, make_message))
-        client.until(lambda: said in observer.said())
+        vehicle.until(lambda: said in observer.said())
 
     show(1)
     publish(candidate, 'calibration: refused by the gate')
     show(2)
-    client.until(lambda: len(answers) == 2)
+    vehicle.until(lambda: len(answers) == 2)
     publish(active, 'predicting stars with the active calibration')
     headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
-    client.until(lambda: len(answers) == 6 and len(infos) == 3)
+    vehicle.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
     assert [info.header for info in infos] == [headers[0], *headers[2:]]
     expected = camera_info_to_message(active, make_message)
@@ -344,32 +321,29 @@ def test_camera_info_per_image(
         assert info == expected
     forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
     calibrations.publish(calibration_to_message(forced, make_message))
-    client.until(lambda: observer.said().count('predicting stars') == 2)
+    vehicle.until(lambda: observer.said().count('predicting stars') == 2)
     header = show(8)
-    client.until(lambda: len(infos) == 4)
+    vehicle.until(lambda: len(infos) == 4)
     assert infos[-1].header == header
     # Best effort may lose some of them, also all of a few.
-    client.until(lambda: lossy or not show(9))
+    vehicle.until(lambda: lossy or not show(9))
     assert lossy[0].k[0] > 0
 
 
-def test_calibrator_collects_while_it_solves(
-    client: Client, start_node: StartNode, tiny_bag: Path, tiny_observations: Ensemble
-) -> None:
+def test_calibrator_collects_while_it_solves(vehicle: Vehicle) -> None:
     """Observations that arrive during a calibration are all counted, bad ones are logged."""
-    calibrator = start_node('calibrator', ros=parameters(tiny_bag))
-    client.fill(tiny_observations.images)
-    observations = client.publisher(StarObservations, 'observations')
-    solve = client.node.create_client(Calibrate, '/calibrator/solve')
-    client.until(solve.service_is_ready)
+    calibrator = vehicle.start_filled()
+    observations = vehicle.publisher(StarObservations, 'observations')
+    solve = vehicle.node.create_client(Calibrate, '/calibrator/solve')
+    vehicle.until(solve.service_is_ready)
     futures = [solve.call_async(Calibrate.Request(dry_run=True)) for _ in range(5)]
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
     for k in range(300):
         refused = refused_image(k, 8, 8, 'no_stars', '')
         observations.publish(observations_to_message(refused, '', make_message))
-    client.until(lambda: all(future.done() for future in futures))
+    vehicle.until(lambda: all(future.done() for future in futures))
     assert all(future.result().success for future in futures)
-    client.until_refused(('bad_observations', 1), ('no_stars', 300))
+    vehicle.until_refused(('bad_observations', 1), ('no_stars', 300))
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
     assert 'Traceback' not in calibrator.said()
 
@@ -438,7 +412,7 @@ def test_bad_parameters(
     text: str,
 ) -> None:
     """A bad parameter ends a node with status 2 and one line that names it."""
-    for node in [start_node(name, ros=arguments(tiny_bag, tmp_path)) for name in names]:
+    for node in [start_node(name, *arguments(tiny_bag, tmp_path)) for name in names]:
         assert node.wait() == 2
         said = node.said()
         lines = [line for line in said.splitlines() if line.startswith(f'{node.name}: ')]
@@ -447,10 +421,10 @@ def test_bad_parameters(
         assert 'Traceback' not in said
 
 
-def test_parameters_while_running(client: Client, start_node: StartNode, tiny_bag: Path) -> None:
+def test_parameters_while_running(vehicle: Vehicle) -> None:
     """Parameters have descriptions, and those in use cannot be changed."""
-    node = start_node('star_observer', ros=parameters(tiny_bag, 'max_attitude_gap_s:=3'))
-    described = client.call(
+    node = vehicle.start('star_observer', 'max_attitude_gap_s:=3')
+    described = vehicle.call(
         DescribeParameters,
         '/star_observer/describe_parameters',
         names=['max_attitude_gap_s', 'attitude_direction', 'max_images'],
@@ -459,13 +433,13 @@ def test_parameters_while_running(client: Client, start_node: StartNode, tiny_ba
     assert gap.floating_point_range[0].from_value == 0.0
     assert 'inertial_to_st' in direction.description
     assert images.integer_range[0].to_value == 100_000
-    manager = Manager(client, 'star_observer')
-    client.until(lambda: manager.state() == 'active')
-    assert 'in use' in set_gap(client, 1.0)
+    manager = Manager(vehicle, 'star_observer')
+    vehicle.until(lambda: manager.state() == 'active')
+    assert 'in use' in set_gap(vehicle, 1.0)
     assert manager.change(DEACTIVATE) and manager.change(CLEANUP)
-    assert set_gap(client, 1.0) == ''
-    assert 'max_attitude_gap_s' in set_gap(client, -1.0)
-    assert 'Type' in set_gap(client, 1.0, 41)
+    assert set_gap(vehicle, 1.0) == ''
+    assert 'max_attitude_gap_s' in set_gap(vehicle, -1.0)
+    assert 'Type' in set_gap(vehicle, 1.0, 41)
     assert manager.change(CONFIGURE) and manager.change(ACTIVATE)
     assert node.process.poll() is None
 
@@ -478,7 +452,7 @@ def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DO
     return '' if answer.results[0].successful else str(answer.results[0].reason)
 
 
-def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: Path) -> None:
+def test_player_loses_nothing(vehicle: Vehicle, tmp_path: Path) -> None:
     """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
     with BagWriter(tmp_path / 'large') as writer:
@@ -488,12 +462,12 @@ def test_player_loses_nothing(client: Client, start_node: StartNode, tmp_path: P
                 writer.write_attitude('/attitude', k * 10**9 + j, np.array([0, 0, 0, 1.0]), 'i')
             writer.write_image('/image', ImageRecord(k * 10**9 + 40, pixels), 'camera')
     # A listener that is slow to take loses what its own history has no room for.
-    images: list[Any] = client.collect(Image, '/image', 24)
-    attitudes: list[Any] = client.collect(QuaternionStamped, '/attitude', 24 * 40)
-    player = start_node('bag_player', ros=('-p', f'bag:={tmp_path / "large"}', '-p', 'rate:=0.0'))
-    client.until(lambda: player.process.poll() is not None)
+    images: list[Any] = vehicle.collect(Image, '/image', 24)
+    attitudes: list[Any] = vehicle.collect(QuaternionStamped, '/attitude', 24 * 40)
+    player = vehicle.start_player(tmp_path / 'large')
+    vehicle.until(lambda: player.process.poll() is not None)
     assert player.process.returncode == 0, player.said()
-    client.until(lambda: len(images) == 24 and len(attitudes) == 24 * 40)
+    vehicle.until(lambda: len(images) == 24 and len(attitudes) == 24 * 40)
     sound = list(reader.read_images([tmp_path / 'large'], '/image'))
     for message, image in zip(images, sound, strict=True):
         got = image_from_message(message)

@@ -13,20 +13,15 @@ import json
 from pathlib import Path
 import subprocess
 import sys
-from typing import TYPE_CHECKING
 
 from ament_index_python.packages import get_packages_with_prefixes
-from node_inputs import BOTH, parameters, REMAPS  # type: ignore[import-not-found]
 from packaging.requirements import Requirement
 import pytest
-from std_srvs.srv import Trigger
+from vehicle import BOTH, REMAPS, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration
 import starcal_ros
 from starcal_ros.formats.messages.record_messages import calibration_from_message
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = [pytest.mark.nodes, pytest.mark.usefixtures('onboard')]
 
@@ -106,27 +101,20 @@ def test_what_stays_on_the_ground_cannot_be_imported() -> None:
 
 
 def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
-    client: Client,
-    start_node: StartNode,
-    tiny_bag: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the messages of a player on the ground, with a state folder."""
     for name in BOTH:
-        ros = (*parameters(tiny_bag, f'state_dir:={tmp_path}/kept'), *REMAPS)
-        start_node(name, ros=ros, forked=False)
-    client.until_listened()
-    ros = ('-p', f'bag:={tiny_bag}', '-p', 'rate:=0.0')
+        vehicle.start(name, f'state_dir:={tmp_path}/kept', ros=REMAPS, forked=False)
+    vehicle.until_listened()
+    ros = ('-p', f'bag:={vehicle.bag}', '-p', 'rate:=0.0')
     with monkeypatch.context() as on_ground:
         on_ground.delenv('PYTHONPATH')
-        player = start_node('bag_player', ros=ros, forked=False)
+        player = vehicle.start_node('bag_player', *ros, forked=False)
     assert player.wait() == 0, player.said()
-    client.until_images(10, 'images_saved')
-    answer = client.call(Trigger, '/calibrator/calibrate')
-    assert answer.success, answer.message
-    published = client.latched(Calibration, 'calibration')
-    client.until(lambda: published)
+    vehicle.until_images(10, 'images_saved')
+    vehicle.calibrate()
+    published = vehicle.until_latched(Calibration, 'calibration')
     done = run('-c', READ, tmp_path / 'kept')
     assert (done.returncode, done.stderr) == (0, '')
     is_accepted, images, sight = json.loads(done.stdout)

@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from rcl_interfaces.srv import GetParameters
+from vehicle import Vehicle  # type: ignore[import-not-found]
 
 from starcal_ros.ros.parameters import folders_of_paths, unread_sections
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -24,14 +21,14 @@ ROOT = Path(__file__).parents[2]
     [('/**/calibrator', True), ('/opnav/calibrator', True), ('calibrator', False)],
 )
 def test_a_section_in_a_namespace(
-    client: Client, start_node: StartNode, tmp_path: Path, section: str, reaches: bool
+    vehicle: Vehicle, tmp_path: Path, section: str, reaches: bool
 ) -> None:
     """What rcl does with it, and that the node warns of what rcl passes over."""
     params = tmp_path / 'params.yaml'
     params.write_text(f'{section}:\n  ros__parameters: {{min_images: 7}}\n')
     ros = ('-r', '__ns:=/opnav', '--params-file', str(params), '-p', 'autostart:=false')
-    node = start_node('calibrator', ros=ros)
-    answer = client.call(GetParameters, '/opnav/calibrator/get_parameters', names=['min_images'])
+    node = vehicle.start_node('calibrator', *ros)
+    answer = vehicle.call(GetParameters, '/opnav/calibrator/get_parameters', names=['min_images'])
     assert answer.values[0].integer_value == (7 if reaches else 3)
     warning = f"section '{section}' does not apply to /opnav/calibrator: write /**/calibrator"
     assert (warning in node.said()) is not reaches
@@ -39,15 +36,16 @@ def test_a_section_in_a_namespace(
 
 @pytest.mark.parametrize('file', ['config/minimal.yaml', 'bags/tiny/params.yaml'])
 def test_a_node_starts_with_a_file_of_the_repository_from_any_folder(
-    client: Client, start_node: StartNode, tiny_bag: Path, file: str
+    vehicle: Vehicle, file: str
 ) -> None:
     """The camera file of the small bag is relative to its parameters, not to this folder."""
     params = ROOT / file
-    more = ('-p', f'camera_info_url:=file://{tiny_bag}/camera.yaml') if 'minimal' in file else ()
+    camera = f'camera_info_url:=file://{vehicle.bag}/camera.yaml'
+    more = ('-p', camera) if 'minimal' in file else ()
     assert more or 'camera_info_url: camera.yaml' in params.read_text()
     assert not Path('camera.yaml').exists()
-    node = start_node('calibrator', ros=('--params-file', str(params), *more))
-    client.until(lambda: 'active, listening to' in node.said())
+    node = vehicle.start_node('calibrator', '--params-file', str(params), *more)
+    vehicle.until(lambda: 'active, listening to' in node.said())
 
 
 def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path: Path) -> None:

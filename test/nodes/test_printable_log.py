@@ -3,16 +3,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import pytest
+from vehicle import Client  # type: ignore[import-not-found]
 
 from starcal_ground.ros.bag_player import BagPlayer
 from starcal_ros.ros.node import StarcalNode
 from starcal_ros.ros.printable_log import PrintableLog, PrintableLogger
-
-if TYPE_CHECKING:
-    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 

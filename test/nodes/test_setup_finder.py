@@ -4,20 +4,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import QuaternionStamped
-from node_inputs import ATTITUDES, IMAGES, parameters, REMAPS  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
+from vehicle import ATTITUDES, Client, IMAGES, REMAPS, Vehicle  # type: ignore[import-not-found]
 import yaml
 
 from starcal.msg import SetupDiagnosis
 from starcal_ground.bags import reader
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -36,51 +32,47 @@ def play(client: Client, bag: Path, nodes: int = 2) -> None:
         images.publish(image.data)
 
 
-def test_five_images_without_a_match_are_diagnosed_until_images_match(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
-    wrong = parameters(tiny_bag, 'attitude_direction:=inertial_to_st')
+def test_five_images_without_a_match_are_diagnosed_until_images_match(vehicle: Vehicle) -> None:
+    wrong = 'attitude_direction:=inertial_to_st'
     names = ('setup_finder', 'star_observer')
-    _, observer = (start_node(name, ros=(*wrong, *REMAPS)) for name in names)
+    _, observer = (vehicle.start(name, wrong, ros=REMAPS) for name in names)
     for name in names:
-        client.until(lambda name=name: client.health(name)[1] == 'waiting for images')
-    said = client.latched(SetupDiagnosis, 'setup_diagnosis')
-    play(client, tiny_bag)
-    client.until(lambda: said)
+        vehicle.until(lambda name=name: vehicle.health(name)[1] == 'waiting for images')
+    said = vehicle.latched(SetupDiagnosis, 'setup_diagnosis')
+    play(vehicle, vehicle.bag)
+    vehicle.until(lambda: said)
     assert said[0].cause == 'attitude_direction'
     assert said[0].parameters == ['attitude_direction: st_to_inertial']
-    client.until_value('diagnosis', 'attitude_direction', 'setup_finder')
-    level, text, values = client.health('setup_finder')
+    vehicle.until_value('diagnosis', 'attitude_direction', 'setup_finder')
+    level, text, values = vehicle.health('setup_finder')
     assert level == b'\x01' and 'Set attitude_direction: st_to_inertial.' in text
     assert (values['diagnosis'], values['callback_errors']) == ('attitude_direction', '0')
-    client.until_value('refused_no_match', '10')
+    vehicle.until_value('refused_no_match', '10')
     observer.stop()
-    again = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
-    client.until(lambda: client.health()[1] == 'waiting for images')
-    play(client, tiny_bag)
-    client.until(lambda: said[-1].cause == 'none')
-    client.until(lambda: client.health('setup_finder')[1] == 'images match')
+    again = vehicle.start('star_observer', ros=REMAPS)
+    vehicle.until(lambda: vehicle.health()[1] == 'waiting for images')
+    play(vehicle, vehicle.bag)
+    vehicle.until(lambda: said[-1].cause == 'none')
+    vehicle.until(lambda: vehicle.health('setup_finder')[1] == 'images match')
     assert 'Traceback' not in again.said()
 
 
-def test_an_alignment_not_given_is_found(
-    client: Client, start_node: StartNode, tiny_bag: Path
-) -> None:
+def test_an_alignment_not_given_is_found(vehicle: Vehicle) -> None:
     """The star observer does not start without one, and names the two ways to find it."""
-    observer = start_node('star_observer', ros=(*parameters(tiny_bag, ZEROS), *REMAPS))
+    observer = vehicle.start('star_observer', ZEROS, ros=REMAPS)
     assert observer.wait() == 2
     refusal = 'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'
     assert f'{refusal} setup_finder beside the camera' in observer.said()
     assert 'Traceback' not in observer.said()
-    finder = start_node('setup_finder', ros=(*parameters(tiny_bag, ZEROS), *REMAPS))
-    client.until(lambda: client.health('setup_finder')[1].endswith('waiting for images'))
-    said = client.latched(SetupDiagnosis, 'setup_diagnosis')
-    play(client, tiny_bag, nodes=1)
-    client.until(lambda: any(one.cause == 'prior_alignment' for one in said))
+    finder = vehicle.start('setup_finder', ZEROS, ros=REMAPS)
+    vehicle.until(lambda: vehicle.health('setup_finder')[1].endswith('waiting for images'))
+    said = vehicle.latched(SetupDiagnosis, 'setup_diagnosis')
+    play(vehicle, vehicle.bag, nodes=1)
+    vehicle.until(lambda: any(one.cause == 'prior_alignment' for one in said))
     (line,) = said[-1].parameters
     found = yaml.safe_load(line)['prior_alignment']
-    given = yaml.safe_load((tiny_bag / 'params.yaml').read_text())['/**']['ros__parameters']
+    given = yaml.safe_load((vehicle.bag / 'params.yaml').read_text())['/**']['ros__parameters']
     # The stars of one image show its rotation to some arcseconds, the star tracker errs by 10.
     turn = abs(np.dot(found, given['prior_alignment']))
     assert 2.0 * np.arccos(min(turn, 1.0)) < np.radians(1.0)
-    client.until(lambda: f'Set prior_alignment: {found}' in finder.said())
+    vehicle.until(lambda: f'Set prior_alignment: {found}' in finder.said())

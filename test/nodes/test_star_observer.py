@@ -6,19 +6,15 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 import threading
-from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import TwistStamped
-from node_inputs import in_this_process  # type: ignore[import-not-found]
 import pytest
+from vehicle import Client, in_this_process  # type: ignore[import-not-found]
 
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
-
-if TYPE_CHECKING:
-    from conftest import Client
 
 pytestmark = pytest.mark.nodes
 

@@ -4,14 +4,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 from geometry_msgs.msg import QuaternionStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from std_srvs.srv import Trigger
+from vehicle import Vehicle  # type: ignore[import-not-found]
 import yaml
 
 from starcal.msg import Calibration, StarObservations
@@ -20,9 +20,6 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND as SECOND_NS
 from starcal_ros.formats.messages.record_messages import calibration_from_message
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
-
-if TYPE_CHECKING:
-    from conftest import Client, StartNode
 
 pytestmark = pytest.mark.nodes
 
@@ -53,11 +50,9 @@ def attitude_messages(mounted: Rotation, from_ns: int, to_ns: int) -> list[Any]:
     ]
 
 
-def test_one_takes_over_from_another(
-    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
-) -> None:
+def test_one_takes_over_from_another(vehicle: Vehicle, tmp_path: Path) -> None:
     """Every image is used, and the calibration has the alignment to each star tracker."""
-    params = parameter_file(tiny_bag, tmp_path / 'params.yaml')
+    params = parameter_file(vehicle.bag, tmp_path / 'params.yaml')
     bag, samples = tmp_path / 'two', attitudes()
     with BagWriter(bag) as writer:
         for k, (time_ns, xyzw) in enumerate(samples):
@@ -68,15 +63,12 @@ def test_one_takes_over_from_another(
         for image in images():
             writer.write_image('/image', image, 'camera')
     for name in ('star_observer', 'calibrator'):
-        start_node(name, ros=('--params-file', str(params)))
-    client.until_listened()
-    player = start_node('bag_player', ros=('-p', f'bag:={bag}', '-p', 'rate:=0.0'))
-    assert player.wait() == 0, player.said()
-    client.until_images(len(images()))
-    answer = client.call(Trigger, '/calibrator/calibrate')
-    assert answer.success, answer.message
-    found = client.latched(Calibration, 'calibration')
-    client.until(lambda: found)
+        vehicle.start_node(name, '--params-file', str(params))
+    vehicle.until_listened()
+    vehicle.play(bag)
+    vehicle.until_images(len(images()))
+    vehicle.calibrate()
+    found = vehicle.until_latched(Calibration, 'calibration')
     first, other = calibration_from_message(found[0]).star_trackers
     assert (first.frame, other.frame) == ('star_tracker', 'other')
     assert first.images + other.images == len(images())
@@ -85,17 +77,17 @@ def test_one_takes_over_from_another(
 
 
 def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
-    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+    vehicle: Vehicle, tmp_path: Path
 ) -> None:
     """The first star tracker is right and comes later, the other is 5 degrees off."""
-    params = parameter_file(tiny_bag, tmp_path / 'params.yaml', wrong_by_deg=5.0)
+    params = parameter_file(vehicle.bag, tmp_path / 'params.yaml', wrong_by_deg=5.0)
     patient = ('--params-file', str(params), '-p', 'attitude_timeout_s:=60.0')
-    start_node('star_observer', ros=patient)
-    found = client.collect(StarObservations, 'observations')
-    first = client.publisher(QuaternionStamped, '/attitude')
-    other = client.publisher(QuaternionStamped, '/other/attitude')
-    shown = client.publisher(Image, '/image', 10)
-    client.until_listened()
+    vehicle.start_node('star_observer', *patient)
+    found = vehicle.collect(StarObservations, 'observations')
+    first = vehicle.publisher(QuaternionStamped, '/attitude')
+    other = vehicle.publisher(QuaternionStamped, '/other/attitude')
+    shown = vehicle.publisher(Image, '/image', 10)
+    vehicle.until_listened()
     sent = 0
 
     def send(publisher: Any, *messages: Any) -> None:
@@ -109,7 +101,7 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
         mounted = Rotation.identity() if publisher is first else FIRST_FROM_OTHER
         about = (image.time_ns - 2 * SECOND_NS, image.time_ns + 2 * SECOND_NS)
         send(publisher, *attitude_messages(mounted, *about))
-        client.until_value('messages', str(sent))
+        vehicle.until_value('messages', str(sent))
 
     for k, image in enumerate(images()[:4]):
         if k >= 2:  # the delay of the first is known
@@ -117,24 +109,24 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
         # One after the other: samples of two topics may come in another order.
         send_attitudes(other, image)
         send_attitudes(first, image)
-        client.until(lambda k=k: len(found) == max(0, k - 1))
+        vehicle.until(lambda k=k: len(found) == max(0, k - 1))
     assert [(one.refusal, one.star_tracker) for one in found] == 2 * [('', '')]
     assert found[0].detail == '' and found[1].detail.startswith('other not used: no_match: ')
-    client.until_value('attitudes_not_used', 'other: 1')
-    assert client.health()[:2] == (b'\x01', found[1].detail)
+    vehicle.until_value('attitudes_not_used', 'other: 1')
+    assert vehicle.health()[:2] == (b'\x01', found[1].detail)
 
 
 def test_the_first_images_wait_for_a_late_one_beside_a_wrong_one(
-    client: Client, start_node: StartNode, tiny_bag: Path, tmp_path: Path
+    vehicle: Vehicle, tmp_path: Path
 ) -> None:
     """No delay is known yet: images are refused by the wrong one, then used by the late one."""
-    params = parameter_file(tiny_bag, tmp_path / 'params.yaml', wrong_by_deg=40.0)
-    start_node('star_observer', ros=('--params-file', str(params)))
-    observed = client.collect(StarObservations, 'observations')
-    client.until_listened()
-    late = client.publisher(QuaternionStamped, '/attitude')
-    wrong = client.publisher(QuaternionStamped, '/other/attitude')
-    shown = client.publisher(Image, '/image', 10)
+    params = parameter_file(vehicle.bag, tmp_path / 'params.yaml', wrong_by_deg=40.0)
+    vehicle.start_node('star_observer', '--params-file', str(params))
+    observed = vehicle.collect(StarObservations, 'observations')
+    vehicle.until_listened()
+    late = vehicle.publisher(QuaternionStamped, '/attitude')
+    wrong = vehicle.publisher(QuaternionStamped, '/other/attitude')
+    shown = vehicle.publisher(Image, '/image', 10)
 
     first = images()[:3]
     until_ns = first[-1].time_ns + 2 * SECOND_NS
@@ -142,10 +134,10 @@ def test_the_first_images_wait_for_a_late_one_beside_a_wrong_one(
         shown.publish(image_to_message(image, 'camera', make_message))
     for message in attitude_messages(FIRST_FROM_OTHER, 0, until_ns):
         wrong.publish(message)
-    client.until(lambda: len(observed) == len(first))
+    vehicle.until(lambda: len(observed) == len(first))
     assert {one.refusal for one in observed} == {'no_match'}
     for message in attitude_messages(Rotation.identity(), 0, until_ns):
         late.publish(message)
-    client.until(lambda: len(observed) == 2 * len(first))
+    vehicle.until(lambda: len(observed) == 2 * len(first))
     again = observed[len(first) :]
     assert [(one.refusal, one.star_tracker) for one in again] == len(first) * [('', '')]

@@ -12,7 +12,7 @@ import re
 from typing import Any
 
 from attacks import bag_setup, observations  # type: ignore[import-not-found]
-from calibrators import Calibrators  # type: ignore[import-not-found]
+from calibrators import Calibrators, scripts  # type: ignore[import-not-found]
 from kept_state import full_disk  # type: ignore[import-not-found]
 import pytest
 
@@ -217,139 +217,79 @@ def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Cal
     made.close_all()
 
 
-# Steps, words of the answer to the last request, and the calibration that is active then.  A
-# candidate moves the corners by so many px; the limit is 0.3 px, 1.5 px from the prior.
-ACTIVATIONS = {
-    # Another request changes the active calibration during the solve.
-    'refused against 1 after a roll-back': (
-        'activate a; activate b 0.25; solve c 0.5 while rollback',
-        'refused by the gate: largest change',
-        'a',
-    ),
-    'accepted against 1 after a roll-back': (
-        'activate a; activate b 0.25; solve c 0.2 while rollback',
-        'activated: ',
-        'c',
-    ),
-    'refused at the start, accepted after a roll-back': (
-        'activate a; activate b 0.25; activate c 0.5; rollback; solve d 0.55 while rollback',
-        'refused by the gate: largest change',
-        'a',
-    ),
-    'of a roll-back that makes it acceptable': (
-        'activate a; activate b 0.25; activate c 0.5; solve d 0.1 while rollback',
-        'activated: ',
-        'd',
-    ),
-    'by force after a roll-back': (
-        'activate a; activate b 0.25; solve c 0.5 force while rollback',
-        'activated: ',
-        'c',
-    ),
-    'dry run after a roll-back': (
-        'activate a; activate b 0.25; solve c 0.5 dry_run while rollback',
-        'refused by the gate: largest change',
-        'a',
-    ),
-    # Roll-backs past calibrations that were forced, withheld or are refused by the gate today.
-    'past a forced one': ('activate a; activate b 2 force; rollback', 'activated again: ', 'a'),
-    'to a forced one': (
-        'activate a 0.25; activate b 2 force; activate c 2.25 force; rollback',
-        'activated again: ',
-        'b',
-    ),
-    'past a forced one that came while others were withheld': (
-        'activate a 0.2; limit 0.01; open A; activate b 0.25 force; limit 0.3; open A; rollback',
-        'activated again: ',
-        'a',
-    ),
-    'forced dry run': ('activate a; solve b 2 dry_run force', 'would be activated: ', 'a'),
-    'a forced one that misses another requirement': (
-        'require f=1e-6px; open A; activate a 0 force; require map=1e-6px; open A; rollback',
-        'no calibration is active',
-        '',
-    ),
-    'past one that is refused today': (
-        'activate a; activate b 0.2; activate c 0.45; activate d 0.3; limit .08; open A; rollback',
-        'calibration 3 is not active, the gate refuses it now: largest change',
-        'b',
-    ),
-    'to none but refused ones': (
-        'activate a 0.5; activate b 0.25; limit 0.08; open A; rollback',
-        'calibration 1 is not active, the gate refuses it now: largest change',
-        'b',
-    ),
-    'from one that a roll-back made active before a restart': (
-        'activate a; activate b .1; activate c .2; rollback; kill; open A; rollback',
-        'activated again: ',
-        'a',
-    ),
-    'to one that was active when the active one came': (
-        'activate a; activate b .1; activate c .2; rollback; rollback; activate d .1; rollback',
-        'activated again: ',
-        'a',
-    ),
-    'to none': ('activate a; rollback', 'there is no calibration before the active one', 'a'),
-    # The limits change, and with them what is active.
-    'withheld': ('activate a 0.25; limit 0.01; open A; rollback', 'no calibration is active', ''),
-    'relaxed': ('activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 0.5', 'act', 'b'),
-    'withheld with another mounting': (
-        'activate a; turn 90; open A; rollback',
-        'no calibration is active',
-        '',
-    ),
-    'relaxed again': (
-        'activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 2',
-        'refused by the gate: largest change',
-        'a',
-    ),
-    'withheld in memory': (
-        'open -; activate a 0.25; limit 0.01; open -; rollback',
-        'no calibration is active',
-        '',
-    ),
-    'relaxed again in memory': (
-        'open -; activate a 0.25; limit .01; open -; limit 0.3; open -; solve b 2; open A',
-        'refused by the gate: largest change',
-        'a',
-    ),
-    'during a solve': (
-        'activate a; limit 0.2; solve b 0 while open A',
-        'not activated: the node was cleaned up meanwhile',
-        'a',
-    ),
-    'during a solve in memory': (
-        'open -; activate a; limit 0.2; solve b 0 while open -; open A',
-        'not activated: the node was cleaned up meanwhile',
-        'a',
-    ),
-    # The answer has the requirements.
-    'met': (
-        'require line_of_sight=1000arcsec@98%; open A; solve a',
-        'activated: .* arcsec, at most 1000 arcsec required: met',
-        'a',
-    ),
-    'missed': (
-        'require f=1e-6px; open A; solve a',
-        r'over the limit of 0.000001 px \(requirements\); missed by',
-        '',
-    ),
-    # A clock that no stamp holds: nothing is written that its reader sets aside.
-    'before 1970': ('activate a; clock -1; solve b', 'not activated, nobody could read', 'a'),
-    'after 2038': (
-        f'activate a; clock {MAX_STAMP_NS + 1}; solve b',
-        f'active_since_ns: {MAX_STAMP_NS + 1} .*; check the ROS clock',
-        'a',
-    ),
-    'rolled back after 2038': (
-        f'activate a; activate b; clock {MAX_STAMP_NS + 1}; rollback',
-        'not activated, nobody could read it',
-        'b',
-    ),
-    'no /clock yet': ('activate a; clock 0; solve b', 'not activated: the ROS clock is 0', 'a'),
-    '1970': ('activate a; clock 1; solve b', 'activated: ', 'b'),
-    '2038': (f'activate a; clock {MAX_STAMP_NS}; solve b', 'activated: ', 'b'),
-}
+# Which calibration is active after steps | words of the answer to the last request.  A candidate
+# moves the corners by so many px; the limit is 0.3 px, 1.5 px from the prior.
+ACTIVATIONS = scripts(rf"""
+# Another request changes the active calibration during the solve.
+refused against 1 after a roll-back -> a | refused by the gate: largest change
+    activate a; activate b 0.25; solve c 0.5 while rollback
+accepted against 1 after a roll-back -> c | activated:
+    activate a; activate b 0.25; solve c 0.2 while rollback
+refused at the start, accepted after a roll-back -> a | refused by the gate: largest change
+    activate a; activate b 0.25; activate c 0.5; rollback; solve d 0.55 while rollback
+of a roll-back that makes it acceptable -> d | activated:
+    activate a; activate b 0.25; activate c 0.5; solve d 0.1 while rollback
+by force after a roll-back -> c | activated:
+    activate a; activate b 0.25; solve c 0.5 force while rollback
+dry run after a roll-back -> a | refused by the gate: largest change
+    activate a; activate b 0.25; solve c 0.5 dry_run while rollback
+# Roll-backs past calibrations that were forced, withheld or are refused by the gate today.
+past a forced one -> a | activated again:
+    activate a; activate b 2 force; rollback
+to a forced one -> b | activated again:
+    activate a 0.25; activate b 2 force; activate c 2.25 force; rollback
+past a forced one that came while others were withheld -> a | activated again:
+    activate a 0.2; limit 0.01; open A; activate b 0.25 force; limit 0.3; open A; rollback
+forced dry run -> a | would be activated:
+    activate a; solve b 2 dry_run force
+a forced one that misses another requirement -> none | no calibration is active
+    require f=1e-6px; open A; activate a 0 force; require map=1e-6px; open A; rollback
+past one refused today -> b | calibration 3 is not active, the gate refuses it now: largest change
+    activate a; activate b 0.2; activate c 0.45; activate d 0.3; limit .08; open A; rollback
+to none but refused -> b | calibration 1 is not active, the gate refuses it now: largest change
+    activate a 0.5; activate b 0.25; limit 0.08; open A; rollback
+from one that a roll-back made active before a restart -> a | activated again:
+    activate a; activate b .1; activate c .2; rollback; kill; open A; rollback
+to one that was active when the active one came -> a | activated again:
+    activate a; activate b .1; activate c .2; rollback; rollback; activate d .1; rollback
+to none -> a | there is no calibration before the active one
+    activate a; rollback
+# The limits change, and with them what is active.
+withheld -> none | no calibration is active
+    activate a 0.25; limit 0.01; open A; rollback
+relaxed -> b | activated:
+    activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 0.5
+withheld with another mounting -> none | no calibration is active
+    activate a; turn 90; open A; rollback
+relaxed again -> a | refused by the gate: largest change
+    activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 2
+withheld in memory -> none | no calibration is active
+    open -; activate a 0.25; limit 0.01; open -; rollback
+relaxed again in memory -> a | refused by the gate: largest change
+    open -; activate a 0.25; limit .01; open -; limit 0.3; open -; solve b 2; open A
+during a solve -> a | not activated: the node was cleaned up meanwhile
+    activate a; limit 0.2; solve b 0 while open A
+during a solve in memory -> a | not activated: the node was cleaned up meanwhile
+    open -; activate a; limit 0.2; solve b 0 while open -; open A
+# The answer has the requirements.
+met -> a | activated: .* arcsec, at most 1000 arcsec required: met
+    require line_of_sight=1000arcsec@98%; open A; solve a
+missed -> none | over the limit of 0.000001 px \(requirements\); missed by
+    require f=1e-6px; open A; solve a
+# A clock that no stamp holds: nothing is written that its reader sets aside.
+before 1970 -> a | not activated, nobody could read
+    activate a; clock -1; solve b
+after 2038 -> a | active_since_ns: {MAX_STAMP_NS + 1} .*; check the ROS clock
+    activate a; clock {MAX_STAMP_NS + 1}; solve b
+rolled back after 2038 -> b | not activated, nobody could read it
+    activate a; activate b; clock {MAX_STAMP_NS + 1}; rollback
+no /clock yet -> a | not activated: the ROS clock is 0
+    activate a; clock 0; solve b
+1970 -> b | activated:
+    activate a; clock 1; solve b
+2038 -> b | activated:
+    activate a; clock {MAX_STAMP_NS}; solve b
+""")
 
 
 @pytest.mark.slow
@@ -358,7 +298,7 @@ def test_what_is_activated_passes_the_gate_of_that_moment(
     name: str, calibrators: Calibrators
 ) -> None:
     """The answer says what is active; so it is after a restart, and no file is set aside."""
-    steps, words, active = ACTIVATIONS[name]
+    steps, active, words = ACTIVATIONS[name]
     calibrators.run('limit 0.3; open A')
     state = calibrators.run(steps)
     answer = calibrators.answer

@@ -14,6 +14,7 @@ import subprocess
 import sys
 import time
 
+from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
@@ -26,7 +27,6 @@ from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
-from starcal_ros.records import CameraGeometry
 from studies import __main__ as studies
 from studies import monte_carlo, trials
 from studies.monte_carlo import Design, Row, StudyResult
@@ -221,12 +221,11 @@ def test_a_prior_far_off_leads_to_the_same_minimum(method: str, outlier_share: f
     fx, _, fy, cx, cy = truth.camera.parameters[:5]
     pinhole = {'fx': 1.2 * fx, 'fy': 1.2 * fy, 'cx': cx + 60.0, 'cy': cy - 80.0}
     camera = truth.camera.replace(**{**dict.fromkeys(PARAMETER_NAMES, 0.0), **pinhole})
-    turned = Rotation.from_quat(truth.star_tracker_from_camera_xyzw)
-    turned *= Rotation.from_rotvec(np.radians(0.3) * np.array([0.6, 0.0, 0.8]))
+    off = Rotation.from_rotvec(np.radians(0.3) * np.array([0.6, 0.0, 0.8]))
     options = trials.calibration_options(method, 20.0, estimate=PARAMETER_NAMES)
     near, far = (
         estimate_calibration(ensemble, prior, options)
-        for prior in (truth, CameraGeometry(camera, turned.as_quat()))
+        for prior in (truth, dataclasses.replace(turned(truth, off), camera=camera))
     )
     apart = parameter_difference(far.geometry, near.geometry) / np.sqrt(np.diag(near.covariance))
     assert np.abs(apart).max() < 0.01

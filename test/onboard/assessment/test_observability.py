@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -25,7 +26,7 @@ from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
+from starcal_ros.records import Ensemble, MapCovariance, StarObservations
 
 SCENARIO = scenario('tiny', seed=4)
 PRIOR, TRUTH = SCENARIO.prior, SCENARIO.truth
@@ -137,7 +138,7 @@ def test_the_status_says_what_was_collected() -> None:
     assert len(status.predicted_sigma) == len(status.parameter_names) == 11
     # Tracker errors of 10, 10 and 40 arcsec in four images, in the axes of the camera; stars and
     # camera add 3 arcsec or so.
-    mounting = Rotation.from_quat(PRIOR.star_tracker_from_camera_xyzw).as_matrix()
+    mounting = PRIOR.star_tracker_from_camera.as_matrix()
     tracker = mounting.T @ np.diag(np.square(SCENARIO.star_tracker_sigma_arcsec)) @ mounting
     arcsec = status.predicted_sigma[-3:] / ARCSECOND_RAD
     assert (arcsec**2 > np.diag(tracker) / 4).all()
@@ -290,8 +291,6 @@ def test_images_are_let_go_before_anything_is_observable() -> None:
 
 def test_a_prior_that_sees_the_stars_behind_it_says_nothing() -> None:
     # A wrong alignment by 180 degrees must not pass for a perfect calibration.
-    turned = Rotation.from_quat(PRIOR.star_tracker_from_camera_xyzw) * Rotation.from_euler(
-        'x', 180, degrees=True
-    )
-    sigma = predicted_sigma(ensemble(), CameraGeometry(PRIOR.camera, turned.as_quat()), OPTIONS)
+    behind = turned(PRIOR, Rotation.from_euler('x', 180, degrees=True))
+    sigma = predicted_sigma(ensemble(), behind, OPTIONS)
     assert np.isinf(sigma).all()

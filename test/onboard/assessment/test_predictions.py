@@ -72,9 +72,7 @@ def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
     fx, skew, fy = (scale * camera.parameters[:3]).tolist()
     camera = camera.replace(fx=fx, skew=skew, fy=fy)
     wuu, wuv, wvv = whitening(image.covariance_px2)
-    start = Rotation.from_quat(given.truth.star_tracker_from_camera_xyzw).inv() * (
-        Rotation.from_quat(image.icrf_from_star_tracker_xyzw).inv()
-    )
+    start = given.truth.icrf_from_camera(image.icrf_from_star_tracker_xyzw).inv()
 
     def whitened(rotvec: Floats) -> Floats:
         seen = (Rotation.from_rotvec(rotvec) * start).apply(image.direction_icrf)

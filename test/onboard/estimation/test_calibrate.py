@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import functools
 from typing import Any
 
+from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -126,8 +127,7 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
         prior_camera = prior_camera.replace(cx=cx + 80.0, cy=cy - 60.0)
         estimate = PARAMETER_NAMES
     off = Rotation.from_euler('xyz', [0.2, -0.2, 0.1], degrees=True)
-    mounting = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw) * off
-    prior = CameraGeometry(prior_camera, mounting.as_quat())
+    prior = dataclasses.replace(turned(TRUTH, off), camera=prior_camera)
     found = estimate_calibration(clean(), prior, options(method, estimate=estimate))
     assert found.termination == 'converged' and found.kept.all()
     error = errors_of(found, TRUTH)

@@ -56,7 +56,7 @@ def campaign(
     share = slow_arcsec / float(np.mean(SIGMA_ARCSEC))
     slow = share * np.array(SIGMA_ARCSEC) * np.random.default_rng([seed, 6]).normal(size=(3, 3))
     assumed = [*ASSUMED[:1], ASSUMED[1] * (wrong or Rotation.identity()), *ASSUMED[2:]]
-    first_from_camera = Rotation.from_quat(given.truth.star_tracker_from_camera_xyzw)
+    first_from_camera = given.truth.star_tracker_from_camera
 
     def reported(index: int, _: StarObservations) -> dict[str, Any]:
         head = heads[index]
@@ -77,7 +77,7 @@ def campaign(
 
 def error_rad(given: Scenario, found: StarTrackerAlignment, head: int) -> Floats:
     """Passive small rotation of the camera frame from the true alignment to the one found."""
-    first_from_camera = Rotation.from_quat(given.truth.star_tracker_from_camera_xyzw)
+    first_from_camera = given.truth.star_tracker_from_camera
     true = MOUNTED[head].inv() * first_from_camera
     return np.asarray(
         (true.inv() * Rotation.from_quat(found.star_tracker_from_camera_xyzw)).as_rotvec()

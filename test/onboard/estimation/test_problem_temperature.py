@@ -55,7 +55,7 @@ def alignment_of(temperature_degc: float, rate_rad: np.ndarray) -> Rotation:
     """True camera_from_star_tracker at a temperature: a passive rotation from the reference."""
     dT = temperature_degc - REFERENCE_DEGC
     turn = Rotation.from_rotvec(-rate_rad * dT)
-    return turn * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv()
+    return turn * TRUTH.star_tracker_from_camera.inv()
 
 
 @functools.cache
@@ -272,7 +272,7 @@ def test_the_camera_at_a_temperature() -> None:
         np.testing.assert_allclose(
             got.camera.parameters, camera_of(degc, FOCAL).parameters, rtol=1e-15
         )
-        turn = Rotation.from_quat(got.star_tracker_from_camera_xyzw) * alignment_of(degc, RATE_RAD)
+        turn = got.star_tracker_from_camera * alignment_of(degc, RATE_RAD)
         assert turn.magnitude() < 1e-15
     assert geometry_at(TRUTH, TemperatureTerms(REFERENCE_DEGC), 50.0) == CameraGeometry(
         TRUTH.camera, TRUTH.star_tracker_from_camera_xyzw

@@ -58,7 +58,7 @@ def ensemble() -> Ensemble:
 @functools.cache
 def warm() -> Ensemble:
     """The same with temperatures, whose camera and alignment change with them."""
-    A = Rotation.from_quat(SCENARIO.truth.star_tracker_from_camera_xyzw).inv()
+    A = SCENARIO.truth.star_tracker_from_camera.inv()
     centre_px = SCENARIO.truth.camera.parameters[3:5]
     above_k = (-30.0, 10.0, -12.0, 25.0, 3.0)
 

@@ -54,28 +54,6 @@ def walk(rng: Generator, m: int, time: float, size: float) -> Floats:
     return np.asarray(size * steps)
 
 
-def test_the_restricted_likelihood_is_that_of_dense_contrasts() -> None:
-    rng = np.random.default_rng(1)
-    m = 7
-    error = rng.normal(size=(m, 3))
-    time = np.arange(m)
-    K = np.exp(-np.abs(np.subtract.outer(time, time)) / 3.0)
-    slow2, noise2 = np.array([0.0, 0.3, 2.0]), np.array([0.5, 1.0])
-    of_stars = 0.4
-    values, information = module._restricted(
-        *np.linalg.eigh(K), error, np.tile(slow2[:, None], (1, 2)), noise2, of_stars, 1.0
-    )
-    contrasts = null_space(np.ones((1, m)))
-    expected = np.zeros((3, 2))
-    for i, s2 in enumerate(slow2):
-        for j, n2 in enumerate(noise2):
-            V = s2 * K + n2 * np.eye(m)
-            within = contrasts.T @ (V + of_stars * np.eye(m)) @ contrasts
-            expected[i, j] = multivariate_normal.logpdf(error.T @ contrasts, cov=within).sum()
-            assert information[i, j] == pytest.approx(np.linalg.inv(V).sum())
-    assert values - values[0, 0] == pytest.approx(expected - expected[0, 0], abs=1e-9)
-
-
 def test_correlations_are_in_time_and_in_the_distance_of_the_boresights() -> None:
     attitudes = Rotation.from_euler('xz', [[0, 0], [10, 40], [30, 80], [180, 0]], degrees=True)
     time_ns = np.array([0, 10, 40, 100], np.int64) * 10**9

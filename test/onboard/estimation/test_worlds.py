@@ -40,18 +40,13 @@ def sound(seed: int) -> Campaign:
 @pytest.mark.slow
 def test_normalised_errors_are_chi_squared() -> None:
     found = [estimated(sound(seed)) for seed in SEEDS]
-    camera = [
-        per_number(one, sound(seed).scenario.truth, slice(0, 10))
-        for seed, one in zip(SEEDS, found, strict=True)
-    ]
+    truths = [sound(seed).scenario.truth for seed in SEEDS]
+    camera = list(map(per_number, found, truths, [slice(0, 10)] * len(found)))
     low, high = chi2.ppf([0.0005, 0.9995], 10 * len(SEEDS)) / (10 * len(SEEDS))
     # A field of unknown size widens the sigma of a lens without one, by a tenth.
     assert 0.85 * low < np.mean(camera) < high
     assert max(camera) < chi2.isf(1e-5, 10) / 10
-    pointing = [
-        per_number(one, sound(seed).scenario.truth, slice(10, 13))
-        for seed, one in zip(SEEDS, found, strict=True)
-    ]
+    pointing = list(map(per_number, found, truths, [slice(10, 13)] * len(found)))
     # Slow errors as large as the noise are part of it until the images show otherwise.
     assert 0.15 < np.mean(pointing) < chi2.isf(0.001, 60) / 60
     assert {one.termination for one in found} == {'converged'}

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 
+from geometries import turn_between  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_sky import errors_sigma, exposure_of, started, with_planets  # type: ignore[import-not-found]
@@ -174,16 +175,14 @@ def test_noise_of_the_star_tracker_is_tracked() -> None:
     # Fits that start from elsewhere end within what their last step leaves: 0.1 sigma.
     sigma_px = np.sqrt(quiet.covariance_px2[:, [0, 2]])
     assert np.abs((jumped.measured_px - quiet.measured_px) / sigma_px).max() < 0.1
-    one, other = (
-        Rotation.from_quat(each.geometry.star_tracker_from_camera_xyzw) for each in (before, after)
-    )
-    assert (one.inv() * other).magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
+    turn = turn_between(before.geometry, after.geometry)
+    assert turn.magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
 
 
 @pytest.mark.slow
 def test_a_drifting_alignment_is_tracked() -> None:
     _, known = searched(0)
-    first = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
+    first = known.geometry
     focal_px = PRIOR.camera.intrinsics[0]
     kept = []
     for turned_px in np.arange(0.0, 4.0, 0.4):
@@ -193,9 +192,8 @@ def test_a_drifting_alignment_is_tracked() -> None:
         kept.append(known.geometry is before.geometry)
     # Under a pixel nothing is corrected, as the next image finds its turn anyway; beyond it is.
     assert 4 <= kept.count(True) <= 8
-    last = Rotation.from_quat(known.geometry.star_tracker_from_camera_xyzw)
     # Of 3.6 px one may be left, and the star tracker's noise has turned the first image by 0.9.
-    assert abs((first.inv() * last).magnitude() * focal_px - 3.6) < 2.0
+    assert abs(turn_between(first, known.geometry).magnitude() * focal_px - 3.6) < 2.0
 
 
 @pytest.mark.parametrize('turn_deg', [0.6, 1.5, 40.0])

@@ -8,6 +8,7 @@ import functools
 from pathlib import Path
 
 import erfa
+from geometries import turn_between, turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_sky import errors_sigma  # type: ignore[import-not-found]
@@ -29,7 +30,7 @@ from starcal_ros.formats.messages.record_messages import (
 )
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import AttitudeSample, CameraGeometry, Ensemble, Image, StarObservations
+from starcal_ros.records import AttitudeSample, Ensemble, Image, StarObservations
 from starcal_ros.sky.astrometry import air_above, apparent_directions, through_the_air
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
 
@@ -42,8 +43,13 @@ def setup(camera_yaml: Path) -> Setup:
     return load_setup(values(camera_yaml))
 
 
+def observed(one: Image, setup: Setup, track: observe.Track | None = None) -> StarObservations:
+    """Observations of an image with the attitudes about the usual one."""
+    return observe.observe_next(one, attitudes(), setup, track)[0]
+
+
 def test_stars_are_observed(setup: Setup) -> None:
-    found = observe.observe_next(image(), attitudes(), setup)[0]
+    found = observed(image(), setup)
     assert found.refusal == '' and len(found) > 100
     assert found.attitude_gap_s == 0.5
     assert found.time_ns == image().time_ns
@@ -76,7 +82,7 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     moved_px = pixel_px - drawn.pixel_px
     assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
     seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
-    found = observe.observe_next(seen, attitudes(), made, observe.Track(TRUTH))[0]
+    found = observed(seen, made, observe.Track(TRUTH))
     place = {
         number: (pixel, direction)
         for number, pixel, direction in zip(
@@ -103,14 +109,14 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     bent_icrf, elevation_rad = through_the_air(drawn.direction_icrf, drawn.time_ns, low.site)
     pixel_px = project(TRUTH.camera, bent_icrf @ drawn.camera_from_icrf.T)
     seen = render(SCENARIO, dataclasses.replace(drawn, pixel_px=pixel_px), 1)
-    upper = observe.observe_next(seen, attitudes(), low, observe.Track(TRUTH))[0]
+    upper = observed(seen, low, observe.Track(TRUTH))
     used = np.isin(drawn.catalog_id, upper.catalog_id)
     assert 30 < len(upper) < len(found) and np.degrees(elevation_rad[used].min()) >= 10.0
 
 
 def test_an_image_of_another_size_is_refused(setup: Setup) -> None:
     small = Image(image().time_ns, image().pixels[:-2].copy())
-    found = observe.observe_next(small, attitudes(), setup)[0]
+    found = observed(small, setup)
     assert (found.refusal, found.detail) == (
         'wrong_size',
         'image of 640 x 510, prior camera of 640 x 512',
@@ -142,9 +148,7 @@ def test_an_image_without_attitude_is_refused(setup: Setup) -> None:
 
 def test_an_image_that_nothing_explains_keeps_its_attitude(setup: Setup) -> None:
     noise = np.random.default_rng(5).normal(40.0, 3.0, image().pixels.shape)
-    found = observe.observe_next(
-        Image(image().time_ns, noise.astype(np.uint16)), attitudes(), setup
-    )[0]
+    found = observed(Image(image().time_ns, noise.astype(np.uint16)), setup)
     assert found.refusal == 'no_stars'
     assert found.attitude_gap_s == 0.5
     assert found.catalog_digest == setup.catalog.digest
@@ -245,24 +249,11 @@ def test_a_refused_image_does_not_put_those_after_it_out_of_order(
 
 @pytest.mark.parametrize('jump_deg', [1.0, 6.0])
 def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float) -> None:
-    turned = CameraGeometry(
-        setup.prior.camera,
-        (
-            Rotation.from_quat(setup.prior.star_tracker_from_camera_xyzw)
-            * Rotation.from_euler('xyz', [0.7, -0.5, 3.0], degrees=True)
-        ).as_quat(),
-    )
-    off = np.array([0.6, -0.8, 0.0]) * np.radians(jump_deg)
-    track, lengths, seen = observe.Track(turned), [], []
+    off = turned(setup.prior, Rotation.from_euler('xyz', [0.7, -0.5, 3.0], degrees=True))
+    jump = Rotation.from_rotvec(np.array([0.6, -0.8, 0.0]) * np.radians(jump_deg))
+    track, lengths, seen = observe.Track(off), [], []
     for index in range(5):
-        held = AttitudeHistory()
-        for sample in attitude_samples(SCENARIO, index):
-            right = Rotation.from_quat(sample.icrf_from_star_tracker_xyzw)
-            reported = right * Rotation.from_rotvec(off) if index == 2 else right
-            held.add(
-                sample.time_ns,
-                attitude_sample(sample.time_ns, reported.as_quat(), 'st_to_inertial'),
-            )
+        held = attitudes(index, turn=jump if index == 2 else None)
         before = track
         found, track = observe.observe_next(image(index), held, setup, track)
         lengths.append(len(found))
@@ -275,11 +266,8 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float)
     used = [length for length, refusal in zip(lengths, seen, strict=True) if not refusal]
     assert min(used) > 60
     # What the first image found of the turned alignment has carried to the last.
-    left = Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw).inv() * Rotation.from_quat(
-        track.geometry.star_tracker_from_camera_xyzw
-    )
     # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
-    assert left.magnitude() < 200 * ARCSECOND_RAD
+    assert turn_between(TRUTH, track.geometry).magnitude() < 200 * ARCSECOND_RAD
 
 
 @pytest.mark.slow
@@ -318,8 +306,8 @@ def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) ->
     url = write_png(tmp_path / 'dark.png', dark)
     with_dark = load_setup(values(camera_yaml, dark_frame='file://' + url))
     np.testing.assert_array_equal(with_dark.detector.dark, dark)
-    spoilt = observe.observe_next(one_image, attitudes(), without)[0]
-    found = observe.observe_next(one_image, attitudes(), with_dark)[0]
+    spoilt = observed(one_image, without)
+    found = observed(one_image, with_dark)
     assert found.refusal == '' and len(found) > max(150, 2 * len(spoilt))
     # The noise of the image alone is left, and nothing is cut off at zero below the dark level.
     assert found.noise_dn == pytest.approx(1.2, rel=0.1)
@@ -331,14 +319,14 @@ def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
     url = write_png(tmp_path / 'dark.png', np.full((512, 640), 7, np.uint8))
     made = load_setup(values(camera_yaml, dark_frame=url))
     assert made.detector.dark is not None and made.detector.dark.dtype == np.uint8
-    found = observe.observe_next(image(), attitudes(), made)[0]
+    found = observed(image(), made)
     assert found.refusal == 'bad_encoding'
     assert found.detail == 'uint16 image, the dark frame is uint8'
     one = scene(SCENARIO, 1)
     light = star_electrons(one.pixel_px, one.flux_electrons, 0.95, (512, 640)) / 100.0
     noise = np.random.default_rng(1).normal(0, 1.0, light.shape)
     pixels = np.clip(np.rint(light + 7 + noise), 0, 255).astype(np.uint8)
-    byte = observe.observe_next(Image(image().time_ns, pixels), attitudes(), made)[0]
+    byte = observed(Image(image().time_ns, pixels), made)
     assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
 
 
@@ -347,10 +335,7 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
 ) -> None:
     """One is put under a star of the third image: bright or dim, the star is left out for it."""
     track = observe.Track(setup.prior)
-    held = AttitudeHistory()
-    for index in range(1, 4):
-        for sample in attitude_samples(SCENARIO, index):
-            held.add(sample.time_ns, sample)
+    held = attitudes(1, 2, 3)
     plain = observe.observe_next(image(3), held, setup)[0]
     star = np.argsort(plain.snr)[len(plain) // 2]
     u, v = np.rint(plain.measured_px[star] + [1.0, 0.0]).astype(int)
@@ -370,12 +355,12 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
 def test_hot_pixels_of_the_dark_frame_are_known_from_the_first_image(
     camera_yaml: Path, tmp_path: Path, setup: Setup
 ) -> None:
-    plain = observe.observe_next(image(), attitudes(), setup)[0]
+    plain = observed(image(), setup)
     u, v = np.rint(plain.measured_px[0]).astype(int)
     dark = np.full(image().pixels.shape, 32, np.uint16)
     dark[v, u] = 60
     made = load_setup(values(camera_yaml, dark_frame=write_png(tmp_path / 'dark.png', dark)))
-    found = observe.observe_next(image(), attitudes(), made)[0]
+    found = observed(image(), made)
     assert found.refused_stars['hot_pixel'] == 1
     assert plain.catalog_id[0] not in found.catalog_id
 
@@ -388,10 +373,10 @@ def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
     path = write_png(tmp_path / 'dark.png', dark)
     made = load_setup(values(camera_yaml, dark_frame=path, max_saturated_pixels=0))
     pixels = image().pixels.copy()
-    plain = observe.observe_next(image(), attitudes(), made)[0]
+    plain = observed(image(), made)
     u, v = np.rint(plain.measured_px[plain.snr.argmax()]).astype(int)
     pixels[v - 1 : v + 2, u - 1 : u + 2] = 4095
-    found = observe.observe_next(dataclasses.replace(image(), pixels=pixels), attitudes(), made)[0]
+    found = observed(dataclasses.replace(image(), pixels=pixels), made)
     brightest = plain.catalog_id[plain.snr.argmax()]
     reason = found.refused_reason[found.refused_catalog_id == brightest]
     assert [list(found.refused_stars)[code] for code in reason] == ['saturated']
@@ -431,9 +416,9 @@ def test_the_rate_of_the_star_tracker_is_recorded(setup: Setup) -> None:
     step = Rotation.from_rotvec(np.radians([0.0, 0.01, 0.0]))
     held = AttitudeHistory()
     middle = Rotation.from_quat(scene(SCENARIO, 1).icrf_from_star_tracker_xyzw)
-    for time_s, turned in ((-0.5, middle * step.inv()), (0.5, middle * step)):
+    for time_s, reported in ((-0.5, middle * step.inv()), (0.5, middle * step)):
         time_ns = image().time_ns + round(time_s * S)
-        held.add(time_ns, attitude_sample(time_ns, turned.as_quat(), 'st_to_inertial'))
+        held.add(time_ns, AttitudeSample(time_ns, reported.as_quat()))
     found = observe.observe_next(image(), held, setup)[0]
     assert not found.refusal
     expected = np.radians([0.0, 0.02, 0.0])

@@ -183,11 +183,9 @@ def test_zeros_stand_for_an_alignment_not_given(camera_yaml: Path) -> None:
 @pytest.mark.parametrize(
     ('changes', 'text'),
     [
-        ({'fx': 35.0, 'fy': 35.0}, 'fx: 35 px is under 96 px.* is it in mm?'),
         ({'fx': 0.035, 'fy': 0.035}, 'fx: 0.035 px is under 96 px'),
         ({'fx': 35e4, 'fy': 35e4}, 'focal length of 350000 px .* in micrometres'),
         ({'cx': 1.54, 'cy': 1.23}, r'principal point \(1.54, 1.23\) is in the first corner'),
-        ({'cx': 5000.0}, 'cx: 5000 px is far outside of the 640 px'),
         ({'fx': 4000.0}, 'fx = 4000 and fy = .* differ by a factor of two'),
     ],
 )

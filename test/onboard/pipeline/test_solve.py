@@ -8,16 +8,13 @@ import hashlib
 import json
 from pathlib import Path
 
+from geometries import turn_between  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_records import plain  # type: ignore[import-not-found]
-from scipy.spatial.transform import Rotation
-from tiny_campaign import ensemble, image, SCENARIO, TRUTH, values  # type: ignore[import-not-found]
+from tiny_campaign import ensemble, image, TRUTH, values  # type: ignore[import-not-found]
+from worlds import each_image  # type: ignore[import-not-found]
 
-from starcal_ground.bag_writer import BagWriter
-from starcal_ground.bags import topics
-from starcal_ground.bags.reader import Topics
-from starcal_ground.simulation.scenario import attitude_samples
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
@@ -31,8 +28,6 @@ from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup, with_method
 from starcal_ros.pipeline.solve import inputs_of, provenance_of
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image, StarObservations
-
-S = 1_000_000_000
 
 
 @pytest.fixture(scope='module')
@@ -99,13 +94,9 @@ def test_a_solution_with_its_statistics(setup: Setup) -> None:
     error = found.geometry.camera.parameters - TRUTH.camera.parameters
     free = [PARAMETER_NAMES.index(name) for name in found.estimated]
     assert np.abs(error[free] / found.sigma[free]).max() < 5
-    turn = (
-        Rotation.from_quat(found.geometry.star_tracker_from_camera_xyzw).inv()
-        * Rotation.from_quat(TRUTH.star_tracker_from_camera_xyzw)
-    ).magnitude()
     # Ten images of 10, 10 and 40 arcsec: 13 in the mean, and 36 of the principal point, whose 0.3
     # px the alignment takes up.
-    assert turn / ARCSECOND_RAD < 50
+    assert turn_between(found.geometry, TRUTH).magnitude() / ARCSECOND_RAD < 50
 
 
 def test_lateral_colour_is_estimated(setup: Setup) -> None:
@@ -184,34 +175,19 @@ def test_equal_inputs_give_equal_numbers(setup: Setup) -> None:
 
 
 @pytest.mark.slow
-def test_a_bag_with_temperatures_to_a_calibration_with_terms(
-    camera_yaml: Path, tmp_path: Path
-) -> None:
-    with BagWriter(tmp_path / 'warm') as writer:
-        for index in range(4):
-            for sample in attitude_samples(SCENARIO, index):
-                quaternion = sample.icrf_from_star_tracker_xyzw
-                writer.write_attitude('/attitude', sample.time_ns, quaternion, 'icrf')
-            one = image(index)
-            writer.write_temperature('/box', one.time_ns - S, 10.0 + 5.0 * index, 'camera')
-            writer.write_temperature('/box', one.time_ns + 1, 99.0, 'camera')
-            writer.write_image('/image', one, 'camera')
+def test_images_with_temperatures_give_a_calibration_with_terms(camera_yaml: Path) -> None:
+    """The simulated camera does not change with temperature, and that is what is found."""
     warm = load_setup(values(camera_yaml, focal_temperature_order=1, alignment_temperature=True))
-    paths = [tmp_path / 'warm']
-    found = list(topics.read(paths, Topics('/image', '/attitude', temperature='/box'), warm))
-    assert [one.temperature_degc for one in found] == [10.0, 15.0, 20.0, 25.0]
-    plain = list(topics.read(paths, Topics('/image', '/attitude'), warm))
-    assert all(np.isnan(one.temperature_degc) for one in plain)
-    # The simulated camera does not change with temperature, and that is what is found.
-    terms = solve.solve(Ensemble(tuple(found)), warm).temperature
-    assert terms is not None and terms.reference_degc == 20.0
-    assert terms.note == ''
+    images = Ensemble(ensemble().images[:4])
+    measured = each_image(images, lambda k, _: {'temperature_degc': 10.0 + 5.0 * k})
+    terms = solve.solve(measured, warm).temperature
+    assert terms is not None and (terms.reference_degc, terms.note) == (20.0, '')
     for values_found, sigma in (
         (terms.focal_per_degc, terms.focal_per_degc_sigma),
         (terms.alignment_rate_rad_per_degc, terms.alignment_rate_rad_per_degc_sigma),
     ):
         assert values_found and (np.abs(values_found) < 4 * np.array(sigma)).all()
-    terms = solve.solve(Ensemble(tuple(plain)), warm).temperature
+    terms = solve.solve(images, warm).temperature
     assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'
 
 

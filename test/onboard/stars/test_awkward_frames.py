@@ -8,12 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sample_sky import QUIET, star_grid  # type: ignore[import-not-found]
+from sample_sky import measured, QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader
 from starcal_ground.simulation.rendering import expose, star_electrons
 from starcal_ros.records import Image, StarRefusal
-from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import (
     Background,
     detect,
@@ -22,19 +21,10 @@ from starcal_ros.stars.detection import (
     sample_mesh,
 )
 from starcal_ros.stars.frame_checks import fingerprint, sample_rows, screen, ScreeningOptions
-from starcal_ros.stars.image_model import CentroidOptions, model_image
 from starcal_ros.stars.pixel_noise import NoiseSums
 
 SHAPE = (512, 640)
-OPTIONS = CentroidOptions()
 WISPR = Path(__file__).parents[4] / 'shared' / 'realsky' / 'wispr_i_2022'
-
-
-def measured(pixels: np.ndarray, xy: np.ndarray) -> Centroids:
-    background = measure_background(pixels)
-    sources = detect(pixels, background)
-    model = model_image(pixels, background, sources, OPTIONS)
-    return measure_stars(pixels, xy, model, OPTIONS)
 
 
 @pytest.mark.parametrize('measure', [measure_background, sample_background])

@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 import pytest
-from sample_sky import QUIET, star_grid  # type: ignore[import-not-found]
+from sample_sky import measured, modelled, QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import centroid_bound
 from starcal_ground.simulation.rendering import expose, star_electrons
@@ -18,12 +18,7 @@ from starcal_ros.records import StarRefusal
 from starcal_ros.stars import psf_fit
 from starcal_ros.stars.centroiding import Centroids, measure_stars, shape_changed
 from starcal_ros.stars.detection import detect, measure_background, sample_mesh
-from starcal_ros.stars.image_model import (
-    CentroidOptions,
-    ImageModel,
-    model_image,
-    saturation_level,
-)
+from starcal_ros.stars.image_model import CentroidOptions, model_image, saturation_level
 from starcal_ros.stars.pixel_noise import blurred_px, PixelNoise, quantisation_step_dn
 from starcal_ros.stars.psf_fit import fit_psf, noise_sums
 
@@ -44,15 +39,6 @@ def exposed(
     return expose(
         mean + detector.background_electrons + more, detector, np.random.default_rng([seed, 1])
     )
-
-
-def modelled(pixels: np.ndarray, options: CentroidOptions = PSF) -> ImageModel:
-    background = measure_background(pixels)
-    return model_image(pixels, background, detect(pixels, background), options)
-
-
-def measured(pixels: np.ndarray, xy: np.ndarray, options: CentroidOptions = PSF) -> Centroids:
-    return measure_stars(pixels, xy, modelled(pixels, options), options)
 
 
 def field(

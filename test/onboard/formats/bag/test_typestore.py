@@ -6,12 +6,10 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import pytest
 from rosbags.typesys import get_typestore, Stores
-from sample_records import observations  # type: ignore[import-not-found]
+from sample_records import observations, with_needed_fields, zeroed  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader
 from starcal_ros.errors import BagError
@@ -87,17 +85,8 @@ def test_a_definition_that_differs_in_words_is_that_of_this_version(text: str) -
 FIELDS = [name for name, _ in store_with(OBSERVATIONS_TYPE).fielddefs[OBSERVATIONS_TYPE][1]]
 
 
-def zeroed(value: Any, is_sequence: bool) -> Any:
-    """Return what ROS has in a field that a sender leaves out."""
-    if isinstance(value, np.ndarray):
-        return value[:0] if is_sequence else np.zeros_like(value)
-    if hasattr(value, 'w'):
-        return replace(value, x=0.0, y=0.0, z=0.0, w=0.0)
-    return type(value)()
-
-
-KINDS = fields_of(StarObservations).items()
-NEEDED = {kind.in_messages for _, kind in KINDS if not kind.has_default}
+KINDS = fields_of(StarObservations).values()
+NEEDED = {kind.in_messages for kind in KINDS if not kind.has_default}
 
 
 @pytest.mark.parametrize('lacking', FIELDS[1:])
@@ -140,14 +129,7 @@ def test_the_needed_fields_alone_are_observations(tmp_path: Path) -> None:
         writer.add_message(writer.register_channel('/o', 'cdr', schema), 1, bytes(data), 1)
         writer.finish()
     (record,) = reader.read_observations([tmp_path], '/o')
-    stated = {
-        name: getattr(sent, name)
-        for name, kind in KINDS
-        if not kind.has_default and name not in ('time_ns', 'width', 'height')
-    }
-    unknown = np.full(len(sent), np.nan, np.float32)
-    stated |= dict.fromkeys(('magnitude', 'flux_dn', 'snr'), unknown)
-    assert record == StarObservations.of_image(sent.time_ns, (sent.width, sent.height), **stated)
+    assert record == with_needed_fields(sent)
 
 
 def test_a_type_of_others_is_that_of_ros_whatever_its_bag_says() -> None:

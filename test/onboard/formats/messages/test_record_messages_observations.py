@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sample_records import assert_same, observations, plain, TIME_NS  # type: ignore[import-not-found]
+from sample_records import assert_same, observations, plain, TIME_NS, with_needed_fields, zeroed  # type: ignore[import-not-found]
 
-from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.bag.typestore import described, make_message
+from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.messages.record_messages import (
     checked_observations,
     observations_from_message,
@@ -105,24 +106,11 @@ def test_refused_stars_are_found_by_reason() -> None:
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
 
 
-STAR_FIELDS = ('catalog_id', 'direction_icrf', 'measured_px', 'covariance_px2')
 NEEDED = {
     kind.in_messages.split('.')[0]
     for kind in fields_of(StarObservations).values()
     if not kind.has_default
 }
-
-
-def zeroed(value: Any) -> Any:
-    """Return what ROS has in a field that a sender leaves out."""
-    if isinstance(value, np.ndarray):
-        is_vector = value.dtype == np.float64  # all others are sequences
-        return np.zeros_like(value) if is_vector else value[:0]
-    if isinstance(value, (str, list)):
-        return type(value)()
-    if hasattr(value, 'w'):
-        return plain('geometry_msgs/msg/Quaternion', x=0.0, y=0.0, z=0.0, w=0.0)
-    return type(value)(0)
 
 
 def test_a_message_with_everything_but_the_stars_at_zero_says_nothing_else() -> None:
@@ -131,18 +119,13 @@ def test_a_message_with_everything_but_the_stars_at_zero_says_nothing_else() -> 
     message = observations_to_message(sent, 'cam', plain)
     others = [name for name in vars(message) if name not in NEEDED]
     assert {'zenith_icrf', 'star_tracker_rate_sigma_rad_s', 'first_from_star_tracker'} <= {*others}
+    definition = described(OBSERVATIONS_TYPE)[0]
     for name in others:
-        setattr(message, name, zeroed(getattr(message, name)))
+        setattr(message, name, zeroed(getattr(message, name), f'[] {name}\n' in definition))
     record = checked_observations(message)
-    # Zero degrees Celsius is a temperature; if all images have it, it does not change.
-    unknown = np.full(len(sent), np.nan, np.float32)
-    stated = {name: getattr(sent, name) for name in STAR_FIELDS}
-    stated |= dict.fromkeys(('magnitude', 'flux_dn', 'snr'), unknown)
-    stated |= {'attitude_gap_s': 0.0, 'temperature_degc': 0.0}
-    stated['icrf_from_star_tracker_xyzw'] = sent.icrf_from_star_tracker_xyzw
-    expected = StarObservations.of_image(sent.time_ns, (sent.width, sent.height), **stated)
     assert not record.refusal, record.detail
-    assert_same(record, expected)
+    # Zero degrees Celsius is a temperature; if all images have it, it does not change.
+    assert_same(record, with_needed_fields(sent, attitude_gap_s=0.0, temperature_degc=0.0))
 
 
 @pytest.mark.parametrize(('sigma_m_s', 'sent'), [(0.0, -1.0), (10.0, 10.0), (np.nan, np.nan)])

@@ -34,16 +34,20 @@ from starcal_ros.formats.messages.record_messages import (
     observations_to_message,
 )
 from starcal_ros.formats.messages.sensor_messages import (
+    BAYER_ENCODINGS,
+    CHANNELS,
     decode_compressed,
     decode_image,
     image_from_message,
     image_of,
     jpeg_header,
     refused_from_message,
+    RGB_ENCODINGS,
     view_image,
 )
 from starcal_ros.records import Image, StarObservations
 
+LETTER = {'red': 'r', 'green': 'g', 'blue': 'b'}
 RAMP = np.arange(12, dtype=np.uint16).reshape(3, 4) * 257 + 3
 
 
@@ -90,6 +94,7 @@ def test_native_images_are_not_copied() -> None:
     [
         ({'encoding': 'yuv422'}, 'bad_encoding', "'yuv422' is not one of mono8"),
         ({'encoding': 'rgb8'}, 'bad_encoding', 'rgb8 is a colour image: set image_channel'),
+        ({'encoding': 'bayer_rggb8'}, 'bad_encoding', 'set image_channel'),
         ({'encoding': ''}, 'bad_encoding', "'' is not"),
         ({'encoding': 'x' * 9999}, 'bad_encoding', 'xxx'),
         ({'width': 0}, 'bad_layout', '0 x 3'),
@@ -116,6 +121,31 @@ def test_image_refusals(change: dict[str, Any], reason: str, detail: str) -> Non
     assert refused.value.reason == reason
     assert detail in refused.value.detail
     assert len(refused.value.detail) < 200
+
+
+@pytest.mark.parametrize('channel', CHANNELS)
+@pytest.mark.parametrize('encoding', list(RGB_ENCODINGS))
+def test_a_plane_is_taken_whatever_its_place(encoding: str, channel: str) -> None:
+    letters, size = RGB_ENCODINGS[encoding]
+    dtype = np.uint8 if size == 1 else np.uint16
+    pixels = np.random.default_rng(1).integers(0, 200, (5, 7, len(letters)), dtype)
+    padded = np.zeros((5, 7 * len(letters) * size + 3), np.uint8)
+    padded[:, :-3] = pixels.reshape(5, -1).view(np.uint8)
+    found = decode_image(raw(encoding, 7, 5, padded.shape[1], False, padded.tobytes()), 1, channel)
+    expected = pixels[:, :, letters.index(LETTER[channel])]
+    assert found.pixels.dtype == dtype and (found.pixels == expected).all()
+
+
+@pytest.mark.parametrize('channel', CHANNELS)
+@pytest.mark.parametrize('encoding', list(BAYER_ENCODINGS))
+def test_the_sites_of_a_colour_are_taken(encoding: str, channel: str) -> None:
+    letters, size = BAYER_ENCODINGS[encoding]
+    # Each pixel holds the letter of its colour: an odd row and column are left over.
+    pattern = np.array([ord(letter) for letter in letters], np.uint8).reshape(2, 2)
+    mosaic = np.tile(pattern, (3, 4))[:5, :7].astype(np.uint8 if size == 1 else np.uint16)
+    step = 7 * size
+    found = decode_image(raw(encoding, 7, 5, step, False, mosaic.tobytes()), 1, channel)
+    assert found.pixels.shape == (2, 3) and (found.pixels == ord(LETTER[channel])).all()
 
 
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Messages of attitude, velocity and temperature: round trips."""
+"""Messages of attitude, velocity and temperature: round trips; their stamps."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sample_records import plain  # type: ignore[import-not-found]
+from sample_records import plain, TIME_NS  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import temperature_to_message, velocity_to_message
 from starcal_ros.formats.bag.typestore import make_message
@@ -19,6 +19,7 @@ from starcal_ros.formats.messages.message_codec import (
     make_header,
     POSE_TYPE,
     quaternion_to_message,
+    stamp_ns,
     vector_to_message,
 )
 from starcal_ros.formats.messages.sensor_messages import (
@@ -27,6 +28,14 @@ from starcal_ros.formats.messages.sensor_messages import (
     temperature_from_message,
     velocity_from_message,
 )
+
+
+@pytest.mark.parametrize('time_ns', [0, 1, 999_999_999, TIME_NS, -1])
+def test_stamps_are_exact(time_ns: int) -> None:
+    """A stamp keeps every nanosecond, before 1970 too."""
+    header = make_header(time_ns, '', plain)
+    assert 0 <= header.stamp.nanosec < 10**9
+    assert stamp_ns(header.stamp) == time_ns
 
 
 def test_velocity_round_trip() -> None:

@@ -52,28 +52,21 @@ projection_matrix:
 def test_camera_info_is_what_camera_info_manager_reads(tmp_path: Path) -> None:
     path = tmp_path / 'camera_info.yaml'
     write_camera_info(CAMERA, path, 'opnav')
-    content = yaml.safe_load(path.read_text())
-    assert list(content) == [
-        'image_width', 'image_height', 'camera_name', 'camera_matrix', 'distortion_model',
-        'distortion_coefficients', 'rectification_matrix', 'projection_matrix',
-    ]  # fmt: skip
     fitted, _ = ros_fit(CAMERA)
     fx, _, fy, cx, cy, k1, k2, k3, p1, p2 = fitted.parameters.tolist()
-    assert content['camera_name'] == 'opnav'
-    assert content['camera_matrix'] == {
-        'rows': 3,
-        'cols': 3,
-        'data': [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+    P = [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]
+    expected = {
+        'image_width': 1296,
+        'image_height': 1024,
+        'camera_name': 'opnav',
+        'camera_matrix': {'rows': 3, 'cols': 3, 'data': [fx, 0, cx, 0, fy, cy, 0, 0, 1]},
+        'distortion_model': 'plumb_bob',
+        'distortion_coefficients': {'rows': 1, 'cols': 5, 'data': [k1, k2, p1, p2, k3]},
+        'rectification_matrix': {'rows': 3, 'cols': 3, 'data': [1, 0, 0, 0, 1, 0, 0, 0, 1]},
+        'projection_matrix': {'rows': 3, 'cols': 4, 'data': P},
     }
-    assert content['distortion_coefficients'] == {
-        'rows': 1,
-        'cols': 5,
-        'data': [k1, k2, p1, p2, k3],
-    }
-    assert content['rectification_matrix']['data'] == [1, 0, 0, 0, 1, 0, 0, 0, 1]
-    assert content['projection_matrix'] == {
-        'rows': 3, 'cols': 4, 'data': [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
-    }  # fmt: skip
+    content = yaml.safe_load(path.read_text())
+    assert content == expected and list(content) == list(expected)
     # Each key on a line of its own: ROS's Python parsers split nothing, people's greps do.
     assert all(len(line) < 400 for line in path.read_text().splitlines())
 

@@ -178,11 +178,7 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
         # Before the field over the detector takes gigabytes.
         (lambda c: c['image'].update(height=2_000_000), 'image size: .* is over 65536 px'),
-        # No message can hold it, so that a calibrator could not publish it.
-        (lambda c: c.update(iterations=2**32), 'iterations: 4294967296 is not within 0 to '),
         (lambda c: c.update(images_used=2**70), 'images_used: .* is not within 64 bit'),
-        (lambda c: c.update(star_tracker_sigma_arcsec=[1.0]), 'sigma_arcsec: 1 numbers, not 3'),
-        (lambda c: c['field'].update(octaves=40), 'field.octaves: 40 is not within 1 to 8'),
         (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
         (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
         (lambda c: c.update(intrinsics=3), 'intrinsics: 3 is not an object'),
