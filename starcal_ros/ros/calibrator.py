@@ -210,16 +210,15 @@ class Calibrator(node.StarcalNode):
             return node.WARN, last.message, numbers
         return node.OK, 'collecting' if active is None else 'calibration active', numbers
 
-    def silent(self) -> list[str]:
-        """Return the topic of the observations if none has come yet."""
-        has_come = self.taken(self._on_observations)
-        return [] if has_come else [self.resolve_topic_name('observations')]
+    def needed(self) -> list[str]:
+        """Return the topic of the observations."""
+        return [self.resolve_topic_name('observations')]
 
     def _with_silence(self, answer: Answer) -> Answer:
         """Return the answer with the reason, first, if no observations have come."""
-        if answer.success or self._state.ensemble.images or not (silent := self.silent()):
+        (topic,) = self.needed()
+        if answer.success or self._state.ensemble.images or self.inputs.has_come(topic):
             return answer
-        (topic,) = silent
         where = self.inputs.elsewhere(topic)
         if not where:
             images = self.inputs.published(IMAGE_TYPE)

@@ -8,6 +8,7 @@ import itertools
 import math
 from pathlib import Path
 import re
+import time
 from typing import TYPE_CHECKING
 
 from geometry_msgs.msg import QuaternionStamped, Twist, TwistStamped
@@ -157,6 +158,32 @@ def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_rece
     client.until(lambda: client.health()[:2] == (b'\x00', 'waiting for images'))
     publishers[0].publish(QuaternionStamped())
     client.until_value('messages', '1')
+
+
+def test_a_driver_that_stops_is_named_until_it_sends_again(
+    client: Client, start_node: StartNode, tiny_bag: Path
+) -> None:
+    node = start_node('star_observer', ros=(*parameters(tiny_bag), *REMAPS))
+    attitudes = client.publisher(QuaternionStamped, ATTITUDES, 10)
+    sample = next(reader.read_raw([tiny_bag], [ATTITUDES])).data
+    client.until(lambda: client.health()[1] == 'waiting for images')
+    begin_s = time.monotonic()
+
+    def has_streamed() -> bool:
+        attitudes.publish(sample)
+        return time.monotonic() > begin_s + 6.0  # a stream: more than five seconds
+
+    client.until(has_streamed)
+    assert client.health()[:2] == (b'\x00', 'waiting for images')
+    client.until(lambda: f'{ATTITUDES}: no message for ' in client.health()[1])
+    assert client.health()[0] == b'\x01'
+    assert node.said().count(f'{ATTITUDES}: no message for ') == 1
+
+    def is_well() -> bool:
+        attitudes.publish(sample)
+        return client.health()[:2] == (b'\x00', 'waiting for images')
+
+    client.until(is_well)
 
 
 def test_a_driver_in_another_namespace_is_named(
