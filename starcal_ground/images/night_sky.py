@@ -67,19 +67,19 @@ def _through_air(
     lost = refusals(one for one in images if one.time_ns in stars.icrf_from_camera)
     notes = [note] if note else []
     notes += [
-        f'{row.count} of {len(images)} images, identified by their brightest stars, do not fit the'
-        f' camera common to all and are refused as {row.reason}: {row.detail or row.meaning}'
+        f'{row.count} of {len(images)} images, identified by their brightest stars, are refused as'
+        f' {row.reason}: {row.detail or row.meaning}'
         for row in lost
     ]
     return images, '; '.join(notes)
 
 
 def _in_words_of_stars(stars: by_stars.FromStars, one: StarObservations) -> StarObservations:
-    """Observations of a copy refused, and of an image without stars as such."""
+    """Observations of a copy refused, and of an image not identified as such."""
     if one.time_ns in stars.copies:
         reason, detail = 'duplicate', stars.copies[one.time_ns]
     elif one.refusal in ('no_attitude', 'attitude_gap'):  # those of the stars were not found
-        reason, detail = 'no_match', 'its stars are no part of the sky'
+        reason, detail = 'no_match', 'its stars were not identified'
     else:
         return one
     return refused_image(one.time_ns, one.width, one.height, reason, detail)

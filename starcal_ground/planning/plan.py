@@ -31,6 +31,7 @@ from starcal_ros.assessment.requirements import (
     FOCAL,
     LINE_OF_SIGHT,
     MAP,
+    NOT_ENOUGH,
     POINTING,
     QUANTITIES,
     REQUIREMENTS,
@@ -67,7 +68,8 @@ class Target:
     """
     A sigma to lower: ``sqrt(tr(squares P) + constant) / unit``.
 
-    ``squares`` (P, P) by the shared unknowns; ``name`` with the unit as suffix.
+    ``squares`` (P, P) by the shared unknowns; ``name`` with the unit as suffix, and ``_rms`` if
+    the requirement of that name is on the largest sigma.
     """
 
     name: str
@@ -95,7 +97,8 @@ def target(estimate: Estimate, name: str) -> Target:
         (of_map, of_pointing), of_pixel = mean_squares(estimate)
         unresolved = of_pixel * estimate.map_covariance.unresolved_px**2
         squares = of_map if name == MAP else of_pointing
-        return Target(f'{name}_arcsec', squares, unresolved, ARCSECOND_RAD)
+        shown = name if name == POINTING else f'{name}_rms'
+        return Target(f'{shown}_arcsec', squares, unresolved, ARCSECOND_RAD)
     labels = QUANTITIES[name].parameters if name in QUANTITIES else (name,)
     if not {*labels} <= {*layout.labels}:
         known = {LINE_OF_SIGHT, MAP, POINTING, FOCAL, *layout.labels}
@@ -104,7 +107,8 @@ def target(estimate: Estimate, name: str) -> Target:
     of_name = np.isin(layout.labels, labels) / len(labels)
     unit = QUANTITIES[name].units[0] if name in QUANTITIES else ''
     scale = ARCSECOND_RAD if unit == 'arcsec' else 1.0
-    return Target('_'.join(filter(None, [name, unit])), np.diag(of_name), 0.0, scale)
+    shown = '_'.join(filter(None, [name, 'rms' * (len(labels) > 1), unit]))
+    return Target(shown, np.diag(of_name), 0.0, scale)
 
 
 def expected_noise_px2(estimate: Estimate, magnitude: Floats) -> Floats:
@@ -354,8 +358,8 @@ class Plan:
     """
     The images to take, in order.
 
-    ``name`` is the sigma with its unit as suffix, ``sigma`` its value now, and ``enough`` the
-    number of images after which the next one lowers it by less than 1 %; None: not reached.
+    ``name`` is that of the `Target`, ``sigma`` its value now, and ``enough`` the number of images
+    after which the next one lowers it by less than 1 %; None: not reached.
     """
 
     name: str
@@ -510,7 +514,7 @@ def _planned(campaign: Campaign, minimise: str, check: GateCheck) -> GateCheck:
             return check  # its remedy is another
         last = significant(scale * plan.steps[-1].sigma, 2)
         unit = check.unit and f' {check.unit}'
-        words = f'{len(plan.steps)} more images reach {last}{unit}'
+        words = f'{len(plan.steps)} more images reach {last}{unit}{NOT_ENOUGH}'
     else:
         place = plan.steps[0].pointing
         words = f'{enough[0]} more images reach it (starcal plan)'

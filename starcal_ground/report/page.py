@@ -128,7 +128,7 @@ def write_report(folder: Path) -> Path:
     """
     Write ``report.html`` from the product files of a folder and return its path.
 
-    In the state folder of a calibrator it is the page of the last calibration.  Where the last
+    In the state folder of a calibrator it is the page of the active one.  Where the last
     calibration into the folder failed, it is the page of that failure.  Raises ProductError,
     BagError when a file cannot be read or the report cannot be written.
     """

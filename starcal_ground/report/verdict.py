@@ -140,8 +140,11 @@ def next_step(calibration: records.Calibration) -> str:
         return ' '.join(f'To lower a sigma most, {row}.' for row in calibration.statements[:1])
     failed = [check for check in calibration.gate if check.passed is False]
     if {check.option for check in failed} == {REQUIREMENTS}:
-        # Behind the first semicolon of the note is the remedy of the largest cause.
-        steps = dict.fromkeys(filter(None, (one.note.partition('; ')[2] for one in failed)))
+        names: dict[str, list[str]] = {}  # of the sigmas, by their step
+        for check in failed:
+            # Behind the first semicolon of the note is the remedy of the largest cause.
+            names.setdefault(check.note.partition('; ')[2], []).append(check.name)
+        steps = [f'{", ".join(of)}: {step}' for step, of in names.items() if step]
         return f'{"; ".join(["The sigmas hold, but miss a requirement", *steps])}.'
     return (
         'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'

@@ -108,10 +108,9 @@ class SetupFinder(StarcalNode):
             return WARN, 'prior_alignment is not given: waiting for images', numbers
         return OK, 'images match' if self._images else 'waiting for images', numbers
 
-    def silent(self) -> list[str]:
-        """Return the image and attitude topics that sent nothing yet."""
-        came = {'image': self._images, 'attitude': len(self._attitudes)}
-        return [self.resolve_topic_name(topic) for topic, count in came.items() if not count]
+    def needed(self) -> list[str]:
+        """Return the topics of the images and attitudes."""
+        return [self.resolve_topic_name(topic) for topic in ('image', 'attitude')]
 
     def _on_image(self, raw: message_codec.RawMessage) -> None:
         frames, offset_s = self._setup.frames, self._setup.attitude.stamp_offset_s

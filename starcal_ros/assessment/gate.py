@@ -117,12 +117,17 @@ def limit_check(
     """
     A value against a multiple of the limit of an option, and something more.
 
-    The remedy is the note of a check that failed.
+    The note explains a limit that is not the value of the option; of a check that failed, it has
+    the remedy too.
     """
     limit = factor * float(getattr(options, option)) + more
     # The condition is the one that must hold, so that NaN fails: a comparison with it is false.
     passed = found >= limit if option.startswith('min_') else found <= limit
-    note = '' if passed else remedy
+    origin = ''
+    if (factor, more) != (1.0, 0.0):
+        added = f' and {significant(more, 2)} {unit}' if more else ''
+        origin = f'limit: {significant(factor, 3)} times {option}{added}'
+    note = '; '.join(filter(None, [origin, '' if passed else remedy]))
     return GateCheck(name, option, float(found), limit, unit, bool(passed), note)
 
 
@@ -284,7 +289,7 @@ def _changes(
         centre_px = estimation.principal_point_prior * max(camera.width, camera.height)
         centre_deg = math.degrees(centre_px / abs(camera.parameters[0]))
     rotation_rad, left_px = movement(before, calibration.geometry)
-    lens = 'the prior camera or its lens model does not match this lens (lens_model)'
+    lens = 'the prior camera or lens_model does not match this lens'
     return _worse(
         limit_check(
             options,

@@ -44,7 +44,7 @@ REMEDIES: Mapping[str, str] = {
     'stars left out as outliers': 'look for smeared or misidentified stars (Residuals)',
     'images whose attitude does not fit': 'check their attitudes and stamps (Alignment)',
     'coverage': 'take images with stars in the empty cells (Coverage)',
-    'mounting of the prior': 'check the alignment assumed (prior_alignment) and the mounting',
+    'mounting of the prior': 'check prior_alignment and the mounting',
     'change of the camera': 'find out if the camera has changed',
     'change of the mounting': 'find out if the mounting has changed',
     # Faults that the stars show.

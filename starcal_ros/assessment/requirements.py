@@ -29,6 +29,7 @@ from starcal_ros.records import (
     DetectorMaps,
     GateCheck,
     SigmaPart,
+    Statement,
     TOTAL,
 )
 from starcal_ros.text import significant
@@ -37,6 +38,8 @@ from starcal_ros.untrusted import shown
 REQUIREMENTS, _NONE = 'requirements', 'none'
 LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
 _LARGEST, _RMS = 'largest ', 'rms '  # over the detector
+NOT_ENOUGH = ', not enough'
+"""End of a remedy that does not reach the limit."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +69,17 @@ class Quantity:
     of_alignment: bool = False
     parameters: tuple[str, ...] = ()
 
-    def variance_arcsec2(self, part: SigmaPart) -> float:
-        """Return the contribution of a cause to the variance, that of a map at its largest."""
-        of_map = part.map_arcsec
+    def variance_arcsec2(self, part: SigmaPart) -> Floats:
+        """
+        Return the contribution of a cause to the variance: the mean, or (63,) over the detector.
+
+        That of an alignment is taken as the same at all pixels.
+        """
+        of_map: tuple[float, ...] = (part.map_arcsec,)
         if self.statistic != _RMS:
-            of_map = max(part.map_over_detector_arcsec, default=of_map)
+            of_map = part.map_over_detector_arcsec or of_map
         turned = part.pointing_arcsec**2 - part.map_arcsec**2
-        return of_map**2 * self.of_camera + turned * self.of_alignment
+        return np.square(of_map) * self.of_camera + turned * self.of_alignment
 
 
 def _maps(calibration: Calibration) -> DetectorMaps:
@@ -195,7 +202,9 @@ class Requirement:
 
         Raises ValueError when the calibration has no maps.
         """
-        sigma = np.ravel(self.quantity.sigma(calibration, self.unit))
+        return self._over_share(self.quantity.sigma(calibration, self.unit))
+
+    def _over_share(self, sigma: Floats | float) -> float:
         known = np.where(np.isfinite(sigma), sigma, np.inf)
         limit = float(np.quantile(known, self.share, method='inverted_cdf'))
         return limit if math.isfinite(limit) else math.nan
@@ -205,13 +214,25 @@ class Requirement:
         causes = [part for part in calibration.sigma_budget if part.cause != TOTAL]
         if not causes:
             return ''
-        cause = max(causes, key=self.quantity.variance_arcsec2).cause
-        is_aligned = self.quantity.of_alignment and calibration.has_alignment
-        scope = 'pointing' if is_aligned else 'camera'
+        largest = max(causes, key=lambda part: self.quantity.variance_arcsec2(part).max())
         for one in calibration.statements:
-            if (one.cause, one.scope) == (cause, scope):
-                return f'state {one.option}: {one.gain}'
-        return remedy_against(cause)
+            if one.cause == largest.cause:
+                return f'state {one.option}{self._gain(one, largest, calibration)}'
+        return remedy_against(largest.cause)
+
+    def _gain(self, stated: Statement, cause: SigmaPart, calibration: Calibration) -> str:
+        """The sigma before and after a statement in words; empty of a parameter: not computed."""
+        if self.quantity.parameters:
+            return ''
+        total = next(part for part in calibration.sigma_budget if part.cause == TOTAL)
+        variance = self.quantity.variance_arcsec2(total)
+        left = variance - stated.removed_share(cause) * self.quantity.variance_arcsec2(cause)
+        falls = self._over_share(np.sqrt(left.clip(0.0))) / self._over_share(np.sqrt(variance))
+        before = self.sigma(calibration)
+        after = falls * before
+        figures = [f'{significant(one, 2)} {self.unit}' for one in (before, after)]
+        enough = '' if after <= self.limit else NOT_ENOUGH
+        return f': {" becomes ".join(figures)} if it is {stated.value}{enough}'
 
 
 def requirements_of(texts: Iterable[str]) -> tuple[Requirement, ...]:

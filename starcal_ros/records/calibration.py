@@ -439,7 +439,7 @@ class Statement:
     ``cause`` the `SigmaPart` that it lowers, empty where not recorded.
 
     >>> str(Statement('star_tracker_slow_arcsec', '5', 'pointing', 77.0, 11.0))
-    'state star_tracker_slow_arcsec: pointing 77″ becomes 11″ if it is 5'
+    'state star_tracker_slow_arcsec: pointing (rms) 77″ becomes 11″ if it is 5'
     """
 
     option: str
@@ -449,15 +449,20 @@ class Statement:
     after_arcsec: float
     cause: str = ''
 
+    def removed_share(self, part: SigmaPart) -> float:
+        """Share of the variance of its cause, a part of the budget, that stating it removes."""
+        gone = part.pointing_arcsec if self.scope == 'pointing' else part.map_arcsec
+        return (self.before_arcsec**2 - self.after_arcsec**2) / max(gone**2, 1e-300)
+
     @property
     def gain(self) -> str:
         """The sigmas in words."""
         before, after = (significant(s, 2) for s in (self.before_arcsec, self.after_arcsec))
-        return f'{before}″ becomes {after}″ if it is {self.value}'
+        return f'{self.scope} (rms) {before}″ becomes {after}″ if it is {self.value}'
 
     def __str__(self) -> str:
         """Sentence for a user."""
-        return f'state {self.option}: {self.scope} {self.gain}'
+        return f'state {self.option}: {self.gain}'
 
 
 @dataclass(frozen=True, eq=False, repr=False)

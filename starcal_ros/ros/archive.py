@@ -5,7 +5,8 @@ State on disk: the ensemble, and the activated calibrations, safe from a crash.
 ``ensemble/00000012.mcap`` is one image, numbered in order of arrival: a whole bag that any reader
 of MCAP opens.  ``ensemble/refused.json`` counts the refused images and names the `Collections`.
 ``calibrations/00000007_calibration_00000003.json`` records that event 7 activated calibration 3
-(here by a roll-back): a ``calibration.json`` with two more keys.
+(here by a roll-back): a ``calibration.json`` with two more keys.  ``active.json`` states which of
+them is active and which were withdrawn, for readers: a calibrator judges them again.
 
 A file is written beside its place, synced, renamed, and the folder synced; it is never changed
 afterwards.  So at any instant each file is complete or absent.
@@ -40,9 +41,9 @@ from starcal_ros.errors import ArchiveError, BagError, errors_as, OptionError, P
 from starcal_ros.files import PART, sync_folder
 from starcal_ros.formats.bag.typestore import observations_bag, observations_in_bag
 from starcal_ros.formats.products import product_files
+from starcal_ros.formats.products.product_files import ActiveFile, STATE_ACTIVE, write_atomically
 from starcal_ros.formats.products.product_files import STATE_CALIBRATIONS as _CALIBRATIONS
 from starcal_ros.formats.products.product_files import STATE_ENSEMBLE as _ENSEMBLE
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.record_fields import Count, json_object, read_record
 from starcal_ros.records import Activation, counted_refusal, Ensemble, StarObservations
 from starcal_ros.ros.joining import Collections
@@ -234,9 +235,10 @@ class Archive:
         self._next_image = 1
         self._counts = _RefusedFile(ARCHIVE_SCHEMA)  # on disk
         self._events: dict[int, _KeptEvent] = {}  # those on disk
+        self._active: ActiveFile | None = None  # last written
         self._lock = _locked(folder)
         self._finish_emptying()
-        parts = [part for own in _OWN for part in (folder / own).glob(f'.*{PART}')]
+        parts = [part for own in ('', *_OWN) for part in (folder / own).glob(f'.*{PART}')]
         # That of `ros2 bag reindex` would hide the images after it from readers of the folder.
         for stale in (*parts, folder / _ENSEMBLE / 'metadata.yaml'):
             with contextlib.suppress(OSError):
@@ -384,6 +386,24 @@ class Archive:
             ) from error
         finally:  # on a full disk, removed files make room for the next call
             self._drop(stamps, history)
+
+    def keep_active(self, active: Activation | None, withdrawn: tuple[str, ...]) -> None:
+        """
+        State which activation is active, and why others are not; `keep` must have kept them.
+
+        Raises ArchiveError when the file cannot be written.
+        """
+        if not self._events:
+            return
+        path = self._events[active.event].path.relative_to(self.folder) if active else ''
+        stated = ActiveFile(ARCHIVE_SCHEMA, self.last_event, str(path), withdrawn)
+        if stated == self._active:
+            return
+        try:
+            write_atomically(self.folder / STATE_ACTIVE, self._seal.sealed(json_object(stated)))
+        except ProductError as error:
+            raise ArchiveError(f'state_dir: {error}') from error
+        self._active = stated
 
     def _keep_event(self, record: Activation) -> None:
         if record.event in self._events:

@@ -97,13 +97,13 @@ class Calibrator(node.StarcalNode):
         check_site(self._setup.site)
         self._state.open(self._setup, self._own)
         self.get_logger().info(str(self._state))
-        for text in (*self._state.damage, *self._state.withheld):
+        for text in (*self._state.damage, *self._state.withheld.values()):
             self.get_logger().error(text)
         # Answers and verdicts use today's parameters: the gate judges stored calibrations again.
         self._last_answer, active = Answer(True, ''), self._state.active
         self._last_gate = 'none'
         if self._state.withheld:
-            self._last_gate = f'refused: {self._state.withheld[0]}'
+            self._last_gate = f'refused: {next(iter(self._state.withheld.values()))}'
         elif active is not None:
             self._note_gate(Answer(True, '', active))
         self._camera_info = self.publisher(CameraInfo, 'camera_info', LATCHED)
@@ -194,7 +194,7 @@ class Calibrator(node.StarcalNode):
         if state.trouble:
             return node.ERROR, f'state not saved, in memory only: {state.trouble}', numbers
         if state.withheld:
-            return node.WARN, '; '.join(state.withheld), numbers
+            return node.WARN, '; '.join(state.withheld.values()), numbers
         if active is not None and active.forced:
             return node.WARN, f'active despite the gate: {"; ".join(active.reasons)}', numbers
         topic = self.resolve_topic_name('calibration')
@@ -210,16 +210,15 @@ class Calibrator(node.StarcalNode):
             return node.WARN, last.message, numbers
         return node.OK, 'collecting' if active is None else 'calibration active', numbers
 
-    def silent(self) -> list[str]:
-        """Return the topic of the observations if none has come yet."""
-        has_come = self.taken(self._on_observations)
-        return [] if has_come else [self.resolve_topic_name('observations')]
+    def needed(self) -> list[str]:
+        """Return the topic of the observations."""
+        return [self.resolve_topic_name('observations')]
 
     def _with_silence(self, answer: Answer) -> Answer:
         """Return the answer with the reason, first, if no observations have come."""
-        if answer.success or self._state.ensemble.images or not (silent := self.silent()):
+        (topic,) = self.needed()
+        if answer.success or self._state.ensemble.images or self.inputs.has_come(topic):
             return answer
-        (topic,) = silent
         where = self.inputs.elsewhere(topic)
         if not where:
             images = self.inputs.published(IMAGE_TYPE)
@@ -351,7 +350,7 @@ class Calibrator(node.StarcalNode):
                 none, camera_info, alignment = none_active_to_messages(
                     self._setup.prior.camera,
                     (frames.star_tracker_frame, frames.camera_frame),
-                    self._state.withheld,
+                    tuple(self._state.withheld.values()),
                     node.make_message,
                 )
                 self._camera_info.publish(camera_info)

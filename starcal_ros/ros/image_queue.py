@@ -21,11 +21,16 @@ from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.records import AttitudeSample
 from starcal_ros.sky.attitude import AttitudeHistory
+from starcal_ros.text import significant
 
 # A stamp this far ahead of the next image is wrong: its attitude will never arrive.
 _WRONG_NS = 10 * NANOSECONDS_PER_SECOND
 WINDOW_S = 60.0
 _MOST = 100_000  # a minute at 1.6 kHz; bounds the memory under a flood of messages
+# Arrivals that show the usual interval of a stream: more than telemetry sends in a burst once a
+# minute, and few enough that an outage of a driver at 10 Hz counts as usual for two minutes.
+_ARRIVALS = 1000
+_LONGER = 2.0  # times the longest interval without a message: a busy machine is late by less
 _SILENT_S = 2.0  # without a sample: no image waits for more of them for its rate
 _LAGS = 100  # samples from which the delay of a star tracker is learned
 _MORE = 2  # silent after so many times its longest lag
@@ -169,6 +174,46 @@ class Recent:
             while self._numbers and self._numbers[0][0] < self._clock_s() - WINDOW_S:
                 self._numbers.popleft()
             return [value for _, value in self._numbers]
+
+
+class Arrivals:
+    """
+    Times of the last messages of a stream, safe to use from several threads.
+
+    By wall clock, which runs at any speed of a replay and without /clock.
+
+    Parameters
+    ----------
+    clock_s : callable
+        Monotonic seconds.
+    """
+
+    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
+        self._clock_s = clock_s
+        self._times_s: deque[float] = deque(maxlen=_ARRIVALS)
+
+    def __bool__(self) -> bool:
+        """True if a message has come."""
+        return bool(self._times_s)
+
+    def add(self) -> None:
+        """Add a message that has just arrived."""
+        self._times_s.append(self._clock_s())
+
+    def ended(self, least_s: float) -> str:
+        """
+        Return why the stream seems to have ended; empty if it does not.
+
+        Nothing came for ``least_s``, and for twice the longest interval of the last messages.
+        Messages within less than ``least_s`` show no usual interval.
+        """
+        times_s = list(self._times_s)
+        if not times_s or times_s[-1] - times_s[0] < least_s:
+            return ''
+        longest_s, silent_s = float(np.diff(times_s).max()), self._clock_s() - times_s[-1]
+        if silent_s < max(least_s, _LONGER * longest_s):
+            return ''
+        return f'no message for {silent_s:.0f} s, at most {significant(longest_s, 2)} s before'
 
 
 class StarTrackers:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 import contextlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 import threading
 from typing import Any
 
@@ -22,6 +22,7 @@ from rclpy.qos import (
 from rclpy.qos_overriding_options import QoSOverridingOptions, QoSPolicyKind
 
 from starcal_ros.formats.messages.message_codec import RawMessage
+from starcal_ros.ros.image_queue import Arrivals
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 """Profile of a topic whose last message also reaches later subscribers."""
@@ -43,6 +44,7 @@ class _Input:
     name: str  # topic on the graph, after remapping
     callback: Callable[..., None]
     qos: QoSProfile
+    of_driver: bool
     adapts: bool
     group: CallbackGroup
     override: QoSOverridingOptions | None
@@ -50,6 +52,7 @@ class _Input:
     kind: Any = None
     subscription: Any = None
     lost: int = 0
+    arrivals: Arrivals = field(default_factory=Arrivals)
 
 
 class Inputs:
@@ -83,15 +86,16 @@ class Inputs:
         """
         Subscribe to a topic, whose publishers may send any one of some types of message.
 
-        With ``adapts`` its reliability may fall to best effort.  With ``raw`` the callback gets a
-        `RawMessage`, also of bytes that are none of a message and that rclpy would drop.
+        With ``adapts``, for topics of drivers, its reliability may fall to best effort.  With
+        ``raw`` the callback gets a `RawMessage`, also of bytes that are none of a message and that
+        rclpy would drop.
         """
         group = group or MutuallyExclusiveCallbackGroup()
         name = self._node.resolve_topic_name(topic)
         override = _reliability_override(self._node, name) if adapts else None
-        adapts = adapts and not override
+        of_driver, adapts = adapts, adapts and not override
         qos = with_reliability(qos, qos.reliability)  # rclpy writes the override into the profile
-        entry = _Input(kinds, topic, name, callback, qos, adapts, group, override, raw)
+        entry = _Input(kinds, topic, name, callback, qos, of_driver, adapts, group, override, raw)
         with self._lock:
             entry.kind = _kind_of(entry, self._node.get_publishers_info_by_topic(name))
             self._subscribe(entry)
@@ -108,10 +112,24 @@ class Inputs:
         with self._lock:
             return sorted(entry.name for entry in self._inputs)
 
+    def has_come(self, name: str) -> bool:
+        """Return True if an input has had a message."""
+        entry = self._named(name)
+        return entry is not None and bool(entry.arrivals)
+
+    def ended(self, name: str, least_s: float) -> str:
+        """Return why the stream of a driver seems to have ended (`Arrivals`); empty otherwise."""
+        entry = self._named(name)
+        # Other nodes send when there is news: they have no usual interval.
+        return entry.arrivals.ended(least_s) if entry is not None and entry.of_driver else ''
+
+    def _named(self, name: str) -> _Input | None:
+        with self._lock:
+            return next((entry for entry in self._inputs if entry.name == name), None)
+
     def elsewhere(self, name: str) -> str:
         """Where messages of an input may be that nobody sends to it; empty: nowhere."""
-        with self._lock:
-            entry = next((entry for entry in self._inputs if entry.name == name), None)
+        entry = self._named(name)
         if entry is None or self._node.count_publishers(name):
             return ''
         # The first type of an input is for nothing else: transforms are no attitudes.
@@ -183,14 +201,17 @@ class Inputs:
 
         received = _type_name(entry.kind)
 
-        def take(data: bytes) -> None:
-            now_ns = self._node.get_clock().now().nanoseconds
-            entry.callback(RawMessage(entry.name, received, '', now_ns, memoryview(data)))
+        def take(message: Any) -> None:
+            entry.arrivals.add()
+            if entry.raw:
+                now_ns = self._node.get_clock().now().nanoseconds
+                message = RawMessage(entry.name, received, '', now_ns, memoryview(message))
+            entry.callback(message)
 
         entry.subscription = self._node.create_subscription(
             entry.kind,
             entry.topic,
-            take if entry.raw else entry.callback,
+            take,
             entry.qos,
             callback_group=entry.group,
             qos_overriding_options=entry.override,

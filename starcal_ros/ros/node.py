@@ -71,7 +71,7 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         self._publishers_made: list[Any] = []
         self.inputs = inputs.Inputs(self)
         self._incompatible: list[str] = []  # publishers that are not received
-        self._elsewhere: dict[str, str] = {}  # by silent topic: others that have a publisher
+        self._quiet: dict[str, str] = {}  # by silent topic: why, or others that have a publisher
         self._errors = 0
         self._taken: Counter[Callable[[Any], None]] = Counter()
         self._counting = threading.Lock()  # guards the counts of errors and messages
@@ -121,8 +121,8 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         """Return level, message and values of the diagnostics of the active node."""
         raise NotImplementedError
 
-    def silent(self) -> list[str]:
-        """Return the topics that the node cannot do without and that sent nothing yet."""
+    def needed(self) -> list[str]:
+        """Return the topics that the node cannot do without, by their names on the graph."""
         return []
 
     def taken(self, callback: Callable[[Any], None]) -> int:
@@ -180,14 +180,23 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         if time.monotonic() > self._trim_due_s:
             self._trim_due_s = time.monotonic() + _TRIM_S
             return_freed_memory()
-        silent = self.silent() if self.is_active and time.monotonic() > self._silent_from_s else []
-        for topic in set(silent) - set(self._elsewhere):
-            self.get_logger().warning(
-                f'{topic}: no message in {_SILENT_S:.0f} s, from'
-                f' {self.count_publishers(topic)} publishers'
-            )
-        self._elsewhere = {topic: self.inputs.elsewhere(topic) for topic in silent}
+        self._look_for_silence()
         self.publish_health()
+
+    def _look_for_silence(self) -> None:
+        """Take note of the needed topics that sent nothing yet, or nothing any more."""
+        before, self._quiet = self._quiet, {}
+        if not self.is_active or time.monotonic() < self._silent_from_s:
+            return
+        for topic in self.needed():
+            why = self.inputs.ended(topic, _SILENT_S)
+            if not why and self.inputs.has_come(topic):
+                continue
+            if topic not in before:
+                publishers = self.count_publishers(topic)
+                never = f'no message in {_SILENT_S:.0f} s, from {publishers} publishers'
+                self.get_logger().warning(f'{topic}: {why or never}')
+            self._quiet[topic] = why or self.inputs.elsewhere(topic)
 
     def publish_health(self) -> None:
         """Publish the diagnostics now."""
@@ -216,11 +225,11 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
         if self.is_active:
             level, text, numbers = self.health()
             doubts = [f'not received: {"; ".join(self._incompatible)}'] * bool(self._incompatible)
-            doubts += [f'{topic}: {why}' for topic, why in self._elsewhere.items() if why]
+            doubts += [f'{topic}: {why}' for topic, why in list(self._quiet.items()) if why]
             if level != ERROR and self._waits_for_clock():
                 level, text = WARN, NO_CLOCK
-            elif level == OK and doubts:
-                level, text = WARN, '; '.join(doubts)
+            elif level != ERROR and doubts:
+                level, text = WARN, '; '.join([*([text] * (level == WARN)), *doubts])
         else:
             state = self._state_machine.current_state[1]
             level, text, numbers = WARN, self.failure or f'not active: {state}', {}

@@ -193,15 +193,10 @@ class StarObserver(StarcalNode):
             return OK, 'waiting for images', numbers
         return OK, 'observing', numbers
 
-    def silent(self) -> list[str]:
-        """Return the image and attitude topics that sent nothing yet."""
-        further = zip(self._setup.mountings, self._star_trackers.histories[1:], strict=True)
-        taken = {
-            'image': self.taken(self._on_image),
-            'attitude': self.taken(self._on_attitude),
-            **{f'{mounting.frame}/attitude': len(history) for mounting, history in further},
-        }
-        return [self.resolve_topic_name(topic) for topic, count in taken.items() if not count]
+    def needed(self) -> list[str]:
+        """Return the topics of the images and attitudes."""
+        further = (f'{mounting.frame}/attitude' for mounting in self._setup.mountings)
+        return [self.resolve_topic_name(topic) for topic in ('image', 'attitude', *further)]
 
     def _on_image(self, raw: message_codec.RawMessage) -> None:
         self._image_arrivals.add(0.0)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 import threading
@@ -57,7 +57,8 @@ class CalibratorState:
         self._now_ns = now_ns
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
-        self.withheld: tuple[str, ...] = ()  # why the gate of today refuses the last calibrations
+        # By number: why the gate of today refuses the last calibrations.
+        self.withheld: Mapping[int, str] = {}
         self._moved = ''  # a sentence on the records in memory when the folder was opened
         # Guards the fields below; never held during a solve.  Activations change only with both
         # locks held, `_disk` first.
@@ -135,22 +136,42 @@ class CalibratorState:
             'camera and a state_dir that can be written, or start the node again without them'
         )
 
-    def _accepted_from(self, event: int) -> tuple[records.Activation | None, tuple[str, ...]]:
+    def _accepted_from(self, event: int) -> tuple[records.Activation | None, dict[int, str]]:
         """
         The last activation at or before an event that the gate of today accepts.
 
-        With a sentence for each that it refuses.
+        With a sentence for each that it refuses, by the number of the calibration.
         """
-        by_event = {record.event: record for record in self._history}
-        record = by_event.get(event)
-        refused = []
-        while record is not None and (why := refusals_today(record.calibration, self._setup)):
+        refused = {}
+        for record in self._back_from(event):
+            why = refusals_today(record.calibration, self._setup)
+            if not why:
+                return record, refused
             number = record.calibration.number
-            refused.append(
+            refused[number] = (
                 f'calibration {number} is not active, the gate refuses it now: {"; ".join(why)}'
             )
+        return None, refused
+
+    def _back_from(self, event: int) -> Iterator[records.Activation]:
+        """The activation of an event, and those that roll-backs would return to."""
+        by_event = {record.event: record for record in self._history}
+        record = by_event.get(event)
+        while record is not None:
+            yield record
             record = by_event.get(record.before) if record.before < record.event else None
-        return record, tuple(refused)
+
+    def _withdrawn(self) -> tuple[str, ...]:
+        """Return why calibrations are not active, to which no roll-back would return."""
+        active = self._active.event if self._active else 0
+        kept = {record.calibration.number for record in self._back_from(active)}
+        withdrawn = dict.fromkeys(record.calibration.number for record in self._history)
+        rolled_back = 'calibration {} is not active, ~/rollback returned to an earlier one'.format
+        return tuple(
+            self.withheld.get(number) or rolled_back(number)
+            for number in withdrawn
+            if number not in kept
+        )
 
     def __str__(self) -> str:
         """Return one line: the state folder, the active calibration and the images."""
@@ -286,14 +307,14 @@ class CalibratorState:
             if earlier is None:
                 kept = ' on record' if wanted else ''
                 missing = f'there is no calibration before the active one{kept}'
-                return Answer(False, '; '.join(refused) or missing)
+                return Answer(False, '; '.join(refused.values()) or missing)
             answer = self._activate(
                 earlier.calibration.number,
                 earlier.before,
                 earlier.calibration,
                 'activated again',
             )
-        return replace(answer, message='; '.join((answer.message, *refused)))
+        return replace(answer, message='; '.join((answer.message, *refused.values())))
 
     def save(self) -> None:
         """Write the records to disk; returns at once where they are there."""
@@ -305,8 +326,10 @@ class CalibratorState:
             return
         with self._records:
             kept = Kept(self._ensemble, self._history, self._collections)
+            active, withdrawn = self._active, self._withdrawn()
         try:
             self._archive.keep(kept.ensemble, kept.history, kept.collections)
+            self._archive.keep_active(active, withdrawn)
             self._on_disk, self.trouble = kept, ''
         except errors.ArchiveError as error:
             self.trouble = str(error)
@@ -341,7 +364,7 @@ class CalibratorState:
         record = records.Activation(self._next_event(), before, active)
         with self._records:
             self._history = (*self._history, record)[-HISTORY:]
-            self._active, self.withheld = record, ()
+            self._active, self.withheld = record, {}
         self._save()
         answer = self._answer(f'{done}: {summary(active)}')
         return replace(answer, calibration=active, active=True)

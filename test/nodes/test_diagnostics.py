@@ -8,6 +8,7 @@ import itertools
 import math
 from pathlib import Path
 import re
+import time
 
 from geometry_msgs.msg import QuaternionStamped, Twist, TwistStamped
 import pytest
@@ -142,6 +143,30 @@ def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_rece
     vehicle.until(lambda: vehicle.health()[:2] == (b'\x00', 'waiting for images'))
     publishers[0].publish(QuaternionStamped())
     vehicle.until_value('messages', '1')
+
+
+def test_a_driver_that_stops_is_named_until_it_sends_again(vehicle: Vehicle) -> None:
+    node = vehicle.start('star_observer', ros=REMAPS)
+    attitudes = vehicle.publisher(QuaternionStamped, ATTITUDES, 10)
+    sample = next(reader.read_raw([vehicle.bag], [ATTITUDES])).data
+    vehicle.until(lambda: vehicle.health()[1] == 'waiting for images')
+    begin_s = time.monotonic()
+
+    def has_streamed() -> bool:
+        attitudes.publish(sample)
+        return time.monotonic() > begin_s + 6.0  # a stream: more than five seconds
+
+    vehicle.until(has_streamed)
+    assert vehicle.health()[:2] == (b'\x00', 'waiting for images')
+    vehicle.until(lambda: f'{ATTITUDES}: no message for ' in vehicle.health()[1])
+    assert vehicle.health()[0] == b'\x01'
+    assert node.said().count(f'{ATTITUDES}: no message for ') == 1
+
+    def is_well() -> bool:
+        attitudes.publish(sample)
+        return vehicle.health()[:2] == (b'\x00', 'waiting for images')
+
+    vehicle.until(is_well)
 
 
 def test_a_driver_in_another_namespace_is_named(vehicle: Vehicle) -> None:

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from starcal_ros.records import AttitudeSample
-from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting, WINDOW_S
+from starcal_ros.ros.image_queue import (
+    Arrivals,
+    ImageQueue,
+    Recent,
+    StarTrackers,
+    Waiting,
+    WINDOW_S,
+)
 
 SECOND_NS, MS = 10**9, 10**6
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
@@ -246,3 +253,31 @@ def test_what_is_old_is_forgotten() -> None:
     assert (recent.median(), recent.largest()) == (270.0, 300.0)
     clock.now_s += WINDOW_S + 1
     assert (recent.rate_hz(), recent.median(), recent.largest()) == (0.0, None, None)
+
+
+@pytest.mark.parametrize(
+    ('steps_s', 'silent_s', 'words'),
+    [
+        ([], 1e6, ''),
+        ([600.0], 1100.0, ''),  # an image each ten minutes
+        ([600.0], 1300.0, 'no message for 1300 s, at most 600 s before'),
+        ([0.1] * 100, 4.9, ''),
+        ([0.1] * 100, 5.1, 'no message for 5 s, at most 0.1 s before'),
+        ([0.01] * 100, 1e6, ''),  # a burst
+        ([*[0.1] * 600, 60.0] * 2 + [0.1] * 600, 100.0, ''),  # telemetry once a minute
+    ],
+)
+def test_a_stream_has_ended_by_its_own_interval(
+    steps_s: list[float], silent_s: float, words: str
+) -> None:
+    clock = Clock()
+    arrivals = Arrivals(clock)
+    assert not arrivals and not arrivals.ended(5.0)
+    arrivals.add()
+    for step_s in steps_s:
+        clock.now_s += step_s
+        arrivals.add()
+    clock.now_s += silent_s
+    assert arrivals and arrivals.ended(5.0) == words
+    arrivals.add()
+    assert not arrivals.ended(5.0)

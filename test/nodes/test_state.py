@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import contextlib
 import dataclasses
 import itertools
+import json
 from pathlib import Path
 import re
 from typing import Any
@@ -17,7 +18,8 @@ from kept_state import full_disk  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ros.constants import MAX_STAMP_NS
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import OptionError, ProductError
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import CalibratorOptions, Setup
 from starcal_ros.records import Ensemble, refused_image, StarObservations
@@ -170,7 +172,7 @@ def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(tmp_path: Path) -> 
         path.write_text(CHECKSUMS.sealed({**content, 'accepted': False, 'reasons': ['forged']}))
     state = started(tmp_path)
     assert state.active is None
-    assert 'its file states that the gate refused it; forged' in state.withheld[0]
+    assert 'its file states that the gate refused it; forged' in state.withheld[1]
     state.close()
 
 
@@ -297,7 +299,11 @@ no /clock yet -> a | not activated: the ROS clock is 0
 def test_what_is_activated_passes_the_gate_of_that_moment(
     name: str, calibrators: Calibrators
 ) -> None:
-    """The answer says what is active; so it is after a restart, and no file is set aside."""
+    """
+    The answer says what is active; so it is after a restart, and no file is set aside.
+
+    Readers of the folder get that one, and none where none is active.
+    """
     steps, active, words = ACTIVATIONS[name]
     calibrators.run('limit 0.3; open A')
     state = calibrators.run(steps)
@@ -311,6 +317,31 @@ def test_what_is_activated_passes_the_gate_of_that_moment(
         calibrators.run('kill')
         state = calibrators.run('open A')
         assert state.damage == ()
+        if active:
+            assert read_calibration(calibrators.disk / 'A').weakest_direction == active
+        else:
+            with pytest.raises(ProductError, match='no calibration is active|holds no calib'):
+                read_calibration(calibrators.disk / 'A')
+
+
+def test_a_folder_states_what_is_active_and_why_others_are_not(calibrators: Calibrators) -> None:
+    calibrators.run('limit 0.3; open A; activate a 0.25; activate b 0.2; rollback')
+    folder = calibrators.disk / 'A'
+    first, last = 'calibration 1 is not active', 'calibration 2 is not active'
+    rolled_back = f'{last}, ~/rollback returned to an earlier one'
+    stated = json.loads((folder / 'active.json').read_text())
+    assert stated['active'] == 'calibrations/00000003_calibration_00000001.json'
+    assert (stated['events'], stated['withdrawn']) == (3, [rolled_back])
+    # A kill before the file was written: the event that it does not count is active.
+    (folder / 'active.json').write_text(json.dumps({**stated, 'events': 2, 'active': ''}))
+    assert read_calibration(folder).weakest_direction == 'a'
+    calibrators.run('limit 0.01; open A')
+    stated = json.loads((folder / 'active.json').read_text())
+    refused, *others = stated['withdrawn']
+    assert stated['active'] == '' and others == [rolled_back]
+    assert refused.startswith(f'{first}, the gate refuses it now: largest change')
+    with pytest.raises(ProductError, match=f'no calibration is active; {first}, the gate'):
+        read_calibration(folder)
 
 
 @pytest.mark.slow

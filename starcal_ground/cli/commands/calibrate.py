@@ -212,10 +212,7 @@ def _print_budget(calibration: Calibration) -> None:
 
 def _print_assumed(assumed: Sequence[tuple[str, str]], calibration: Calibration) -> None:
     """Print what nobody stated, with what stating it would gain."""
-    gains = {
-        row.option.split()[0].strip(','): f'{row.scope} {row.gain}'
-        for row in calibration.statements
-    }
+    gains = {row.option.split()[0].strip(','): row.gain for row in calibration.statements}
     assumptions = {name: f'assumed {text}' for name, text in assumed}
     names = dict.fromkeys([*assumptions, *gains])
     if names:

@@ -38,7 +38,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--images', type=images, default=10, metavar='N', help=what)
     what = (
         'sigma to lower, by the names of --require: line_of_sight (default), map, pointing, f, or'
-        ' a parameter such as k1'
+        ' a parameter such as k1; rms over the detector, and of both focal lengths'
     )
     add('--minimise', default='line_of_sight', metavar='NAME', help=what)
     allowed = command.add_mutually_exclusive_group()

@@ -8,7 +8,7 @@ block for signatures.
 
   # from the files of an earlier calibration
   starcal report out
-  # of the last calibration of a calibrator, from its state_dir
+  # of the active calibration of a calibrator, from its state_dir
   starcal report state
 """
 

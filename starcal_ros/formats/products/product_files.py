@@ -27,6 +27,7 @@ from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, ch
 from starcal_ros.untrusted import shown
 
 STATE_CALIBRATIONS, STATE_ENSEMBLE = 'calibrations', 'ensemble'  # in a state folder
+STATE_ACTIVE = 'active.json'
 SCHEMA = 1
 _LONGEST_REASON = 500  # characters: a text of the file may be in it
 CALIBRATION_FILE = 'calibration.json'
@@ -109,6 +110,21 @@ class _Published:
         return CameraGeometry(camera, self.alignment.quaternion_xyzw)
 
 
+@dataclass(frozen=True)
+class ActiveFile:
+    """
+    Which calibration of a state folder is active, and why others are not any more.
+
+    ``active`` is the path of its file within the folder, empty if none is active; ``events`` the
+    number of the last event that this takes into account.
+    """
+
+    schema: int
+    events: Count
+    active: str
+    withdrawn: tuple[str, ...] = ()
+
+
 def write_calibration(calibration: Calibration, path: Path) -> None:
     """Write ``calibration.json``, NaN and infinity as null; raises ProductError if it cannot."""
     write_atomically(path, calibration_text(calibration))
@@ -161,7 +177,7 @@ def read_calibration(path: Path | str) -> Calibration:
 
 def calibration_file(path: Path) -> Path:
     """
-    Path of the calibration in a folder, the last in a state folder, or the file itself.
+    Path of the calibration in a folder, the active one in a state folder, or the file itself.
 
     Raises ProductError if there is none.
     """
@@ -170,10 +186,21 @@ def calibration_file(path: Path) -> Path:
     if (path / CALIBRATION_FILE).exists():
         return path / CALIBRATION_FILE
     activated = (path / STATE_CALIBRATIONS).glob(f'{8 * "[0-9]"}*_calibration_*.json')
-    last = max(activated, key=lambda file: int(file.name.partition('_')[0]), default=None)
-    if last is None:
+    events = {int(file.name.partition('_')[0]): file for file in activated}
+    if not events:
         raise ProductError(f'{path}: the folder holds no {CALIBRATION_FILE}')
-    return last
+    last = events[max(events)]
+    if not (path / STATE_ACTIVE).exists():
+        return last
+    with errors_as(ProductError, path / STATE_ACTIVE):
+        stated = read_record(ActiveFile, read_json(path / STATE_ACTIVE))
+    if max(events) > stated.events:  # a kill came before the activation was stated
+        return last
+    active = next((file for file in events.values() if file == path / stated.active), None)
+    if active is None:
+        why = '; '.join(('no calibration is active', *stated.withdrawn))
+        raise ProductError(f'{path}: {why}; to read one all the same, give its file')
+    return active
 
 
 def calibration_from_content(path: Path, content: object) -> Calibration:

@@ -45,7 +45,7 @@ def test_a_bag_of_which_nothing_is_stated(tmp_path, direction, starcal, monkeypa
     assert 'star_tracker_sigma_arcsec: assumed from the scatter of the images' in text
     joined = ' '.join(text.split())
     # What lowers a sigma most, by how much.
-    ((before, after),) = re.findall('noise; pointing (.*?)″ becomes (.*?)″ if', joined)
+    ((before, after),) = re.findall(r'noise; pointing \(rms\) (.*?)″ becomes (.*?)″ if', joined)
     assert float(after) < float(before)
     assert 'lens model plumb_bob, 640 x 512 px' in text
     *_, last = text.split('\n\n')

@@ -485,14 +485,18 @@ def test_a_site_counts_where_the_times_are_known_and_the_ground_alone_is_not_sta
         assert is_named == (of_files == {'dated': False})
 
 
-def test_images_identified_and_then_refused_are_counted_with_the_reason() -> None:
+@pytest.mark.parametrize(
+    ('reason', 'detail'),
+    [('no_match', 'stars match in one part of the image only'), ('smeared', 'streaks of 30 px')],
+)
+def test_images_identified_and_then_refused_are_counted_with_their_own_reason(
+    reason: str, detail: str
+) -> None:
     identified = dict.fromkeys((1, 2), Rotation.identity())
     stars = FromStars(ideal_camera((640, 512), 1800.0), False, identified, 3)
-    detail = 'stars match in one part of the image only'
-    images = [refused_image(time_ns, 640, 512, 'no_match', detail) for time_ns in (1, 2, 3)]
+    images = [refused_image(time_ns, 640, 512, reason, detail) for time_ns in (1, 2, 3)]
     _, note = _through_air(stars, SiteOptions(), True, images)
     assert note == (
-        '2 of 3 images, identified by their brightest stars, do not fit the camera common to all'
-        f' and are refused as no_match: {detail}'
+        f'2 of 3 images, identified by their brightest stars, are refused as {reason}: {detail}'
     )
     assert _through_air(stars, SiteOptions(), True, images[2:])[1] == ''

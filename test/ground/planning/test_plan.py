@@ -79,7 +79,7 @@ def test_the_images_then_give_the_sigma_that_was_expected(setup, ensemble, plann
     # bench, whose worst, of larger amplitudes, is far more.
     assert planned.steps[-1].sigma == pytest.approx(reported, rel=0.15)
     assert reported < 0.8 * planned.sigma
-    assert planned.name == 'map_arcsec' and 0.0 < planned.sigma < 1.0
+    assert planned.name == 'map_rms_arcsec' and 0.0 < planned.sigma < 1.0
 
 
 @pytest.mark.slow
@@ -196,7 +196,11 @@ def test_the_best_candidate_is_the_one_whose_variance_is_least(ensemble, first) 
 
 
 def test_sigmas_have_the_names_and_units_of_requirements(first) -> None:
-    """The map has a smaller one than lines of sight, which have the alignment."""
+    """
+    An rms has the name of a requirement only if that is on the rms.
+
+    The map has a smaller sigma than lines of sight, which have the alignment.
+    """
     covariance = first.posterior.covariance
 
     def planned(name: str, unit: str) -> float:
@@ -204,14 +208,14 @@ def test_sigmas_have_the_names_and_units_of_requirements(first) -> None:
         assert wanted.name == name + unit
         return wanted.sigma(covariance)
 
-    assert planned('map', '_arcsec') < planned('line_of_sight', '_arcsec')
-    assert planned('pointing', '_arcsec') == planned('line_of_sight', '_arcsec')
+    assert planned('map', '_rms_arcsec') < planned('line_of_sight', '_rms_arcsec')
+    assert planned('pointing', '_arcsec') == planned('line_of_sight', '_rms_arcsec')
     names = (*first.geometry.camera.parameter_names, *ALIGNMENT_NAMES)
     sigma = dict(zip(names, np.sqrt(np.diag(first.covariance)), strict=True))
     for name, unit, expected in (
         ('k1', '', sigma['k1']),
         ('fx', '_px', sigma['fx']),
-        ('f', '_px', np.hypot(sigma['fx'], sigma['fy']) / np.sqrt(2.0)),
+        ('f', '_rms_px', np.hypot(sigma['fx'], sigma['fy']) / np.sqrt(2.0)),
         ('alignment_y', '_arcsec', sigma['alignment_y'] / ARCSECOND_RAD),
     ):
         assert planned(name, unit) == pytest.approx(expected, rel=1e-9)  # rounding

@@ -71,7 +71,10 @@ MEND = 'Do not use it for navigation. Mend the causes of the failed checks and c
         (
             ('requirements',),
             'missed by 4 arcsec; take more images',
-            'The sigmas hold, but miss a requirement; take more images.',
+            (
+                'The sigmas hold, but miss a requirement; '
+                'largest 1-sigma of line_of_sight, largest 1-sigma of map: take more images.'
+            ),
         ),
         (('requirements',), 'missed by 4', 'The sigmas hold, but miss a requirement.'),
         (('requirements', 'min_images'), 'missed by 4 arcsec; take more images', MEND),

@@ -314,13 +314,28 @@ def test_each_limit_of_a_change_trips_alone(
     (reason,) = reasons(found, beyond, active)
     assert reason.startswith(check.name) and f'({limit})' in reason
     changed = {
-        ('max_change_px', True): '(lens_model)',
+        ('max_change_px', True): 'the prior camera or lens_model does not match this lens',
         ('max_change_px', False): 'find out if the camera has changed',
-        ('max_rotation_deg', True): 'alignment assumed (prior_alignment) and the mounting',
+        ('max_rotation_deg', True): 'check prior_alignment and the mounting',
         ('max_rotation_deg', False): 'find out if the mounting has changed',
     }
     assert reason.endswith(changed[limit, active is None]) and len(reason) <= 200
     assert ('active calibration' in reason) == (active is not None)
+
+
+@pytest.mark.parametrize(
+    ('geometry', 'option', 'note'),
+    [
+        (LONGER, 'max_change_px', '5 times max_change_px'),
+        (TURNED_FAR, 'max_rotation_deg', '13 times max_rotation_deg and 0.61 deg'),
+    ],
+)
+def test_a_limit_that_is_not_the_value_of_its_option_is_explained(
+    geometry: CameraGeometry, option: str, note: str
+) -> None:
+    found, loose = dataclasses.replace(GOOD, geometry=geometry), GateOptions(max_rotation_deg=7.0)
+    assert checks(found, loose, None)[option].note == f'limit: {note}'
+    assert checks(found, loose, GOOD)[option].note == ''
 
 
 @pytest.mark.parametrize(('width', 'limit_px'), [(640, 50.0), (1000, 64.0), (2592, 165.9)])

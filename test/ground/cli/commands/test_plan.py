@@ -30,7 +30,7 @@ def test_the_table_and_the_file_say_the_same(allowed, tiny_products, tmp_path, s
         rows = list(csv.DictReader(file))
     assert sorted(float(row['ra_deg']) for row in rows) == [10.0, 100.0, 200.0]
     for line, row in zip(shown[2:], rows, strict=False):
-        assert float(line.split()[-1]) == pytest.approx(float(row['map_arcsec']), rel=1e-3)
+        assert float(line.split()[-1]) == pytest.approx(float(row['map_rms_arcsec']), rel=1e-3)
     assert 'no other pointing can be reached after image 3' in shown
     content = json.loads(starcal('plan', *observed, *given[:2], '--images', 1, '--json').out)
-    assert content['name'] == 'line_of_sight_arcsec' and len(content['steps']) == 1
+    assert content['name'] == 'line_of_sight_rms_arcsec' and len(content['steps']) == 1
