@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from starcal_ground import campaign
 from starcal_ground.bags.topics import Topics
 from starcal_ground.images.first_setup import Given, source_of
+from starcal_ground.source_diagnosis import calibrated
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.predictions import Residuals
@@ -315,7 +316,7 @@ def calibrate_images(
 def _calibrated(given: Given) -> Calibration:
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         source = campaign.chosen(source_of(given, Path(name), Path(name)))
-        return campaign.calibrate(campaign.observe(source), inputs_of(source.files)).calibration
+        return calibrated(campaign.observe(source), inputs_of(source.files)).calibration
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:

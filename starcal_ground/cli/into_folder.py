@@ -130,7 +130,9 @@ def _calibrated(
         progress = functools.partial(progress_bar, label='images again')
         made = campaign.calibrate(observed, inputs, progress)
     except TooFewObservations as error:
-        failure = _failure(str(error), observed)
+        from starcal_ground.source_diagnosis import failure_of  # slow, and seldom needed
+
+        failure = failure_of(error, observed)
         if not observed.source.setup.has_tracker:  # its bags are temporary
             failure = dataclasses.replace(failure, inputs=tuple(inputs))
         look = _write_failure(folder, failure, album.unmatched)
@@ -166,27 +168,6 @@ def _drawn(
         return '', f'no report: {missing_package(error)}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
     return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
-
-
-def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
-    """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ground.diagnosis.bags import refusals
-    from starcal_ground.source_diagnosis import cause_of_refusals
-
-    source, count = observed.source, len(observed.observations)
-    groups = refusals(observed.observations)
-    refused = {group.reason: group.count for group in groups}
-    if count and sum(refused.values()) == count:
-        words = f'no image of {count} can be used'
-    if refused:
-        words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
-    named = tuple(map(str, source.bags))
-    cause = cause_of_refusals(observed)
-    if cause is None:
-        return NotCalibrated(words, named, refused)
-    command = 'starcal diagnose' if source.setup.has_tracker else ''
-    words = f'{cause.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
-    return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
 
 
 def _write_failure(
