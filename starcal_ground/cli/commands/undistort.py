@@ -30,13 +30,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import products, undistortion
-    from starcal_ground.images.photographs import image_paths, Refusals
+    from starcal_ground.images.photographs import images_of, Refusals
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     calibration = read_calibration(calibration_file(args.calibration))
-    paths = image_paths(args.images)
-    if not paths:
-        raise IngestError(f'{args.images[0]}: no images')
+    paths = images_of(args.images)
     products.make_folder(args.output)
     outputs = [undistortion.written_to(path, args.output) for path in paths]
     if repeated := next((path for path in outputs if outputs.count(path) > 1), None):
