@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import number_of
-from starcal_ground.undistortion import MIRRORED, mirrored
+from starcal_ground.mirror import MIRRORED, mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.fits_keywords import Card, value_of

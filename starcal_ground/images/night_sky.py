@@ -30,7 +30,7 @@ from starcal_ground.images import photographs as image_files
 from starcal_ground.images import stated as stated_facts
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
-from starcal_ground.undistortion import MIRRORED, mirrored
+from starcal_ground.mirror import MIRRORED, mirrored
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars

@@ -35,7 +35,7 @@ from starcal_ground.file_kinds import (
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import FocalLength, Moment, number_of
 from starcal_ground.images.image_series import FileFacts, scale_of
-from starcal_ground.undistortion import mirrored
+from starcal_ground.mirror import mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
