@@ -125,7 +125,8 @@ def write_observations(
     """
     Write the observations of a calibration with the frame of its camera; raises BagError.
 
-    Without a star tracker, the attitudes are those of the stars.  ``origin`` is `Setup.origin`.
+    Without a star tracker, the attitudes are those of the stars.  ``origin`` is the metadata of
+    `BagWriter`.
     Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
     """
     path = folder / OBSERVATIONS_FILE
