@@ -8,7 +8,7 @@ from the same observations, with the same options.  BLAS runs on one thread mean
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 import dataclasses
 import hashlib
 from pathlib import Path
@@ -20,6 +20,8 @@ from numpy.typing import ArrayLike, NDArray
 from starcal_ground import campaign
 from starcal_ground.bags.topics import Topics
 from starcal_ground.images.first_setup import Given, source_of
+from starcal_ground.images.image_series import FileFacts
+from starcal_ground.source_diagnosis import calibrated
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.predictions import Residuals
@@ -276,7 +278,12 @@ def calibrate_bag(
 
 
 def calibrate_images(
-    images: Path | str | Sequence[Path | str], *, image_topic: str = '', **options: object
+    images: Path | str | Sequence[Path | str],
+    *,
+    image_topic: str = '',
+    times: Mapping[str, int] | None = None,
+    flip: str = '',
+    **options: object,
 ) -> Calibration:
     """
     Calibration of a camera from images of the sky alone; nothing is written.
@@ -288,6 +295,11 @@ def calibrate_images(
         are not used.
     image_topic : str
         Needed where a bag has more than one topic of images.
+    times : mapping, optional
+        Middle of the exposure, ns since the Unix epoch, of each image file by its name without
+        folders; replaces that of the files, as ``--times``.
+    flip : str
+        ``left-right`` or ``top-bottom``: the image files are mirrored, as ``--flip``.
     **options
         Options of a parameter file by name.
 
@@ -309,13 +321,14 @@ def calibrate_images(
     (False, 10)
     """
     paths = [Path(one) for one in ([images] if isinstance(images, (str, Path)) else images)]
-    return _calibrated(Given(paths, Topics(image=image_topic), options, camera_alone=True))
+    facts, topics = FileFacts(times, flip), Topics(image=image_topic)
+    return _calibrated(Given(paths, topics, options, camera_alone=True, facts=facts))
 
 
 def _calibrated(given: Given) -> Calibration:
     with tempfile.TemporaryDirectory(prefix='starcal_') as name:
         source = campaign.chosen(source_of(given, Path(name), Path(name)))
-        return campaign.calibrate(campaign.observe(source), inputs_of(source.files)).calibration
+        return calibrated(campaign.observe(source), inputs_of(source.files)).calibration
 
 
 def write_calibration(calibration: Calibration, path: Path | str) -> None:

@@ -8,9 +8,10 @@ The folder holds ``residuals.npz`` and, in place of a calibration that failed,
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 import contextlib
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 import io
 import json
 import os
@@ -124,7 +125,8 @@ def write_observations(
     """
     Write the observations of a calibration with the frame of its camera; raises BagError.
 
-    Without a star tracker, the attitudes are those of the stars.  ``origin`` is `Setup.origin`.
+    Without a star tracker, the attitudes are those of the stars.  ``origin`` is the metadata of
+    `BagWriter`.
     Where rosbag2 reads the bags, the wheel that writes them is absent: a warning says so.
     """
     path = folder / OBSERVATIONS_FILE
@@ -182,7 +184,11 @@ def read_residuals(path: Path) -> Residuals:
 
 @dataclass(frozen=True)
 class NotCalibrated:
-    """Why bags gave no calibration; ``cause`` and the rest as `starcal diagnose` has them."""
+    """
+    Why bags gave no calibration; ``cause`` and the rest as `starcal diagnose` has them.
+
+    The counts are those of a calibration; ``images_used`` is None if no star was measured.
+    """
 
     reason: str
     inputs: tuple[str, ...]
@@ -191,6 +197,32 @@ class NotCalibrated:
     evidence: tuple[str, ...] = ()
     mend: tuple[str, ...] = ()
     software: str = ''
+    images_used: int | None = None
+    stars_used: int = 0
+    stars_refused: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def counts(self) -> tuple[str, ...]:
+        """Images and stars, used and refused, as of a calibration; empty if none was measured."""
+        if self.images_used is None:
+            return ()
+        return (
+            f'images: {self.images_used} used, refused: {reasons_in_words(self.images_refused)}',
+            f'stars: {self.stars_used} used, refused: {reasons_in_words(self.stars_refused)}',
+        )
+
+
+def refused_stars(observations: Iterable[StarObservations]) -> dict[str, int]:
+    """Refused stars of images by their reason, the most frequent first."""
+    counts: Counter[str] = Counter()
+    for one in observations:
+        counts.update(one.refused_stars)
+    return {reason: count for reason, count in counts.most_common() if count}
+
+
+def reasons_in_words(refused: Mapping[str, int]) -> str:
+    """Numbers that are refused by their reason, in words."""
+    return ', '.join(f'{count} {reason}' for reason, count in refused.items()) or 'none'
 
 
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, field, replace
@@ -14,7 +13,15 @@ from pathlib import Path
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.contents import topic_contents, TopicContent
-from starcal_ground.campaign import calibrate, looked_up, Observed, observed_of, Progress, Source
+from starcal_ground.campaign import (
+    calibrate,
+    Campaign,
+    looked_up,
+    Observed,
+    observed_of,
+    Progress,
+    Source,
+)
 from starcal_ground.diagnosis.bags import (
     diagnose_bags,
     of_most,
@@ -25,6 +32,7 @@ from starcal_ground.diagnosis.bags import (
 )
 from starcal_ground.diagnosis.diagnose import Diagnosis
 from starcal_ground.file_kinds import explained
+from starcal_ground.products import NotCalibrated, refused_stars
 from starcal_ros.errors import BagError, OptionError, StarcalError, TooFewObservations
 from starcal_ros.records import StarObservations
 from starcal_ros.sky.attitude import AttitudeOptions
@@ -160,7 +168,7 @@ def _contents(
             default=math.nan,
         ),
         stars_per_image=tuple(len(one) for one in used) if any(map(len, used)) else (),
-        refused_stars=dict(sum((Counter(one.refused_stars) for one in used), Counter())),
+        refused_stars=refused_stars(used),
     )
 
 
@@ -197,10 +205,46 @@ def _all_the_same(refused: Sequence[Refused], fits: Diagnosis, images: int) -> D
     return replace(by_images, evidence=(*fits.evidence, *by_images.evidence), mend=mend)
 
 
-def cause_of_refusals(observed: Observed) -> Diagnosis | None:
+def calibrated(observed: Observed, inputs: Mapping[str, str] | None = None) -> Campaign:
+    """`calibrate`, whose error names the cause and has the counts of `failure_of`."""
+    try:
+        return calibrate(observed, inputs)
+    except TooFewObservations as error:
+        raise TooFewObservations(failure_of(error, observed).reason) from error
+
+
+def failure_of(error: TooFewObservations, observed: Observed) -> NotCalibrated:
+    """Record of a failed calibration: counts, and the cause for which most images are refused."""
+    source, images = observed.source, observed.observations
+    groups = refusals(images)
+    refused = {group.reason: group.count for group in groups}
+    used = [one for one in images if not one.refusal]
+    record = NotCalibrated(
+        str(error) if used or not images else f'no image of {len(images)} can be used',
+        tuple(map(str, source.bags)),
+        refused,
+        images_used=len(used),
+        stars_used=sum(map(len, used)),
+        stars_refused=refused_stars(images),
+    )
+    reason = f'{record.reason} ({"; ".join(record.counts)})'
+    cause = _cause_of_refusals(observed, groups)
+    if cause is None:
+        return replace(record, reason=reason)
+    command = 'starcal diagnose' if source.setup.has_tracker else ''
+    return replace(
+        record,
+        reason=f'{cause.in_a_sentence(command)} {reason[0].upper()}{reason[1:]}',
+        cause=cause.cause,
+        evidence=cause.evidence,
+        mend=cause.mend,
+    )
+
+
+def _cause_of_refusals(observed: Observed, groups: Sequence[Refused]) -> Diagnosis | None:
     """The cause for which most are refused, by a diagnosis where all are; None if none shows."""
     source, count = observed.source, len(observed.observations)
-    refused = of_most(refusals(observed.observations), count)
+    refused = of_most(groups, count)
     if not (source.topics.image and 0 < sum(group.count for group in refused) == count):
         return of_refusals(refused, count)
     try:

@@ -11,12 +11,11 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from starcal_ground.mirror import flips_in, mirrored
 from starcal_ros.arrays import Singles
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.errors import IngestError
@@ -24,18 +23,9 @@ from starcal_ros.formats.image_files import content_of, decoded, is_fits, read_f
 from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import Calibration, PIXELS_OF
 
-MIRRORED = {'left-right': 'mirrored left to right', 'top-bottom': 'mirrored top to bottom'}
-"""Words, by the name of a flip, of the provenance of a calibration of mirrored image files."""
 _ROWS = 128  # rows of a map made at once: those of 5 megapixels together take a gigabyte
 _OUTSIDE_PX = -1e4  # cv2.remap gives such a pixel no light; it does not define that of NaN
 _ENDINGS = ('.png', '.tif', '.tiff', '.jpg', '.jpeg')  # kinds of files that keep their kind
-
-
-def mirrored(values: NDArray[Any], flip: str) -> NDArray[Any]:
-    """Values (height, width, ...) of an image after a flip of `MIRRORED`; '': as they are."""
-    if flip == 'top-bottom':
-        return values[::-1]
-    return values[:, ::-1] if flip else values
 
 
 def straight_camera(camera: CameraModel) -> CameraModel:
@@ -84,6 +74,11 @@ def written_to(path: Path, folder: Path) -> Path:
     return folder / f'{path.name.partition(".")[0]}{ending}'
 
 
+def flips_of(calibration: Calibration) -> list[str]:
+    """Flips of `MIRRORED` of the image files that a calibration was made from."""
+    return flips_in(calibration.provenance.get(PIXELS_OF, ''))
+
+
 def undistort_file(
     path: Path, calibration: Calibration, maps: tuple[Singles, Singles], output: Path
 ) -> None:
@@ -103,9 +98,8 @@ def undistort_file(
         values = image.values
     else:
         values = decoded(path, content_of(path))
-    pixels_of = calibration.provenance.get(PIXELS_OF, '')
-    for flip, words in MIRRORED.items():
-        values = mirrored(values, flip * (words in pixels_of))
+    for flip in flips_of(calibration):
+        values = mirrored(values, flip)
     height, width = maps[0].shape
     if values.shape[:2] != (height, width):
         size = f'{values.shape[1]} x {values.shape[0]}'

@@ -87,6 +87,8 @@ Wanted = str | tuple[str, str]  # a topic, or its messages of one type
 MAGIC = b'\x89MCAP0\r\n'
 _MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
 _SUFFIXES = ('.mcap', '.db3') if rosbag2.READS_BAGS else ('.mcap',)
+IMAGE_FILE = 'image file '  # start of keys of `ORIGIN`: the stamp of an image follows, ns
+OF_ANOTHER_BAG = ' (of another bag)'  # behind the name of a file that two bags have
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
 _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
 _RECORD = struct.Struct('<BQ')  # kind, length
@@ -134,8 +136,23 @@ def origin_of(paths: Iterable[Path | str]) -> tuple[str, dict[str, str]]:
             elif name.startswith(ORIGINAL):
                 name = name.removeprefix(ORIGINAL)
                 while originals.setdefault(name, text) != text:
-                    name += ' (of another bag)'
+                    name += OF_ANOTHER_BAG
     return '; '.join(pixels_of), originals
+
+
+def image_files(paths: Iterable[Path | str], offset_ns: int = 0) -> dict[int, str]:
+    """
+    Names of the files that the images of bags were made of, by stamp; empty for recorded bags.
+
+    ``offset_ns`` is added to the stamps, as for those of the images.  Raises BagError as
+    `mcap_files`.
+    """
+    return {
+        int(stamp) + offset_ns: printable(value)
+        for file in mcap_files(paths)
+        for key, value in _stated_origin(file).items()
+        if (stamp := key.removeprefix(IMAGE_FILE)) != key and stamp.isdecimal()
+    }
 
 
 def _stated_origin(file: Path) -> dict[str, str]:

@@ -16,6 +16,7 @@ from types import FrameType
 from typing import Any, NoReturn, TYPE_CHECKING, TypeVar
 
 from starcal_ground.cli.terminal import print_text, print_wrapped
+from starcal_ground.mirror import MIRRORED
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.text import printable
 
@@ -28,7 +29,6 @@ if TYPE_CHECKING:
 
 Record = TypeVar('Record', bound='DataclassInstance')
 EXIT_ACCEPTED, EXIT_BAD_INPUT, EXIT_REFUSED, EXIT_INTERRUPTED = 0, 2, 3, 130
-FLIPS = ('left-right', 'top-bottom')
 BAGS = 'an .mcap file or a bag folder'
 _BAGS_OR_IMAGES = 'an .mcap file, a bag folder, or images: files, a folder, or a pattern in quotes'
 _TOPICS = ('image', 'attitude', 'velocity', 'temperature', 'observations')
@@ -135,7 +135,7 @@ def add_file_facts(command: argparse.ArgumentParser) -> None:
     )
     command.add_argument('--times', type=path, metavar='FILE', help=what)
     what = 'the image files are mirrored: mirror them back'
-    command.add_argument('--flip', choices=FLIPS, default='', help=what)
+    command.add_argument('--flip', choices=tuple(MIRRORED), default='', help=what)
 
 
 def file_facts(args: argparse.Namespace) -> FileFacts:

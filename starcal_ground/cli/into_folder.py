@@ -20,6 +20,7 @@ from starcal_ground.products import NotCalibrated
 from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
+from starcal_ros.formats.messages.message_codec import offset_ns
 from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
@@ -88,12 +89,13 @@ def calibrate_into(
         raise OptionError(selection.without_images())
     products.make_folder(folder)
     # After all reading: the bag may be the observations.mcap of an earlier run in this folder.
-    _write_observations(observed.observations, folder, source.setup)
+    origin = _origin_of(source)
+    _write_observations(observed.observations, folder, source.setup, origin)
     with ThreadPoolExecutor(1, 'pictures') as thread:
         drawn = thread.submit(album.thumbnails)
         if with_report:
             thread.submit(_load_report)
-        made = _calibrated(folder, observed, inputs(), album)
+        made = _calibrated(folder, observed, inputs(), album, origin)
         pictures: tuple[thumbnails.Thumbnail, ...] = ()
         with drawings.kind('pictures of images'):
             again = {
@@ -124,28 +126,41 @@ def _calibrated(
     observed: campaign.Observed,
     inputs: Mapping[str, str],
     album: thumbnails.Album,
+    origin: Mapping[str, str],
 ) -> campaign.Campaign:
     """The calibration of observed images; a failure is recorded in the folder."""
     try:
         progress = functools.partial(progress_bar, label='images again')
         made = campaign.calibrate(observed, inputs, progress)
     except TooFewObservations as error:
-        failure = _failure(str(error), observed)
+        from starcal_ground.source_diagnosis import failure_of  # slow, and seldom needed
+
+        failure = failure_of(error, observed)
         if not observed.source.setup.has_tracker:  # its bags are temporary
             failure = dataclasses.replace(failure, inputs=tuple(inputs))
         look = _write_failure(folder, failure, album.unmatched)
         raise TooFewObservations(f'{failure.reason}{look}') from error
     made = with_images_to_reach(made)
     if made.observations is not observed.observations:
-        _write_observations(made.observations, folder, made.setup)
+        _write_observations(made.observations, folder, made.setup, origin)
     return made
 
 
+def _origin_of(source: campaign.Source) -> dict[str, str]:
+    """Metadata of the observations: files that the bags, and each image, were made from."""
+    offset_s = source.setup.attitude.stamp_offset_s if source.topics.image else 0.0
+    names = reader.image_files(source.bags, offset_ns(offset_s))
+    return source.setup.origin | {f'{reader.IMAGE_FILE}{k}': name for k, name in names.items()}
+
+
 def _write_observations(
-    observations: Sequence[StarObservations], folder: Path, setup: Setup
+    observations: Sequence[StarObservations],
+    folder: Path,
+    setup: Setup,
+    origin: Mapping[str, str],
 ) -> None:
     frame = setup.frames.camera_frame
-    products.write_observations(observations, folder, frame, setup.has_tracker, setup.origin)
+    products.write_observations(observations, folder, frame, setup.has_tracker, origin)
 
 
 def _load_report() -> None:
@@ -166,27 +181,6 @@ def _drawn(
         return '', f'no report: {missing_package(error)}'
     content = page.Found(made.calibration, made.residuals, made.observations, pictures)
     return page.render(content, folder), f'look at {folder / products.REPORT_FILE}'
-
-
-def _failure(words: str, observed: campaign.Observed) -> NotCalibrated:
-    """The record of a failure, with the cause for which most images are refused."""
-    from starcal_ground.diagnosis.bags import refusals
-    from starcal_ground.source_diagnosis import cause_of_refusals
-
-    source, count = observed.source, len(observed.observations)
-    groups = refusals(observed.observations)
-    refused = {group.reason: group.count for group in groups}
-    if count and sum(refused.values()) == count:
-        words = f'no image of {count} can be used'
-    if refused:
-        words += f' ({", ".join(f"{reason} {count}" for reason, count in refused.items())})'
-    named = tuple(map(str, source.bags))
-    cause = cause_of_refusals(observed)
-    if cause is None:
-        return NotCalibrated(words, named, refused)
-    command = 'starcal diagnose' if source.setup.has_tracker else ''
-    words = f'{cause.in_a_sentence(command)} {words[0].upper()}{words[1:]}'
-    return NotCalibrated(words, named, refused, cause.cause, cause.evidence, cause.mend)
 
 
 def _write_failure(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
@@ -21,6 +20,7 @@ from starcal_ground.bags.topics import Topics
 from starcal_ground.blind.images import LOOKED_AT
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes, WireAttitudes
 from starcal_ground.diagnosis.diagnose import diagnose, Diagnosis, found_alignment
+from starcal_ground.products import refused_stars
 from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused
@@ -212,7 +212,7 @@ def refusals(records: Iterable[StarObservations]) -> tuple[Refused, ...]:
             IMAGE_REFUSALS.get(reason, ''),
             group[0].time_ns,
             _detail(group),
-            dict(sum((Counter(one.refused_stars) for one in group), Counter()).most_common()),
+            refused_stars(group),
         )
         for reason, group in sorted(groups.items(), key=lambda item: -len(item[1]))
     )

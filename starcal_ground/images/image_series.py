@@ -19,9 +19,9 @@ from numpy.typing import NDArray
 
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import number_of
-from starcal_ground.undistortion import MIRRORED, mirrored
+from starcal_ground.mirror import MIRRORED, mirrored
 from starcal_ros.arrays import Pixels
-from starcal_ros.errors import IngestError
+from starcal_ros.errors import IngestError, OptionError
 from starcal_ros.formats.fits_keywords import Card, value_of
 from starcal_ros.formats.image_files import FileImage, read_image
 from starcal_ros.formats.messages.sensor_messages import of_mosaic
@@ -37,10 +37,17 @@ class FileFacts:
 
     ``times`` holds stamps of the middle of the exposure by file name, which replace those of the
     files; ``flip`` is a key of `MIRRORED` if the files are mirrored images, else empty.
+
+    Raises OptionError for another flip.
     """
 
     times: Mapping[str, int] | None = None
     flip: str = ''
+
+    def __post_init__(self) -> None:
+        """Check the flip, which a program may state."""
+        if self.flip and self.flip not in MIRRORED:
+            raise OptionError(f'flip: {self.flip!r} is not one of {", ".join(MIRRORED)}')
 
     @property
     def pixels_of(self) -> str:

@@ -30,13 +30,14 @@ from starcal_ground.images import photographs as image_files
 from starcal_ground.images import stated as stated_facts
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
-from starcal_ground.undistortion import MIRRORED, mirrored
+from starcal_ground.mirror import MIRRORED, mirrored
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.setup import load_setup, option_groups
+from starcal_ros.pipeline.solve import input_name
 from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
 from starcal_ros.robust_statistics import MAD_TO_SIGMA
 from starcal_ros.sky.astrometry import SiteOptions
@@ -162,7 +163,8 @@ def from_photographs(
     stars = _half_turned(stars) if by_rows else stars
     flip = ('top-bottom' if by_rows else 'left-right') if stars.mirrored else ''
     bag = folder / 'images.mcap'
-    with BagWriter(bag) as writer:
+    names = {f'{reader.IMAGE_FILE}{one.time_ns}': input_name(one.path) for one in photographs}
+    with BagWriter(bag, names) as writer:
         for image in _images(photographs, image_files.Refusals(), channel, is_rendered):
             if flip:
                 image = Image(image.time_ns, mirrored(image.pixels, flip).copy())

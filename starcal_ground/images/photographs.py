@@ -35,7 +35,7 @@ from starcal_ground.file_kinds import (
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import FocalLength, Moment, number_of
 from starcal_ground.images.image_series import FileFacts, scale_of
-from starcal_ground.undistortion import mirrored
+from starcal_ground.mirror import mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
@@ -117,16 +117,17 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
     A folder with a bag in it is a bag.  Raises IngestError for a pattern that matches nothing, and
     for images beside a bag.
     """
-    files: list[Path] = []
+    files: dict[Path, None] = {}  # each once
     bags: list[Path] = []
     expanded = {pattern: matching(pattern) for pattern in paths}
     if nothing := next((pattern for pattern, found in expanded.items() if not found), None):
         raise IngestError(f'{nothing}: no such files')
     for path in itertools.chain.from_iterable(expanded.values()):
         if not path.is_dir():
-            files.append(path)
+            files[path] = None
         elif not (any(path.glob('*.mcap*')) or (path / 'metadata.yaml').exists()):
-            files += sorted(file for file in path.iterdir() if not file.name.startswith('.'))
+            names = sorted(file for file in path.iterdir() if not file.name.startswith('.'))
+            files |= dict.fromkeys(names)
         else:
             bags.append(path)
     if not any(map(_is_image, files)):
@@ -135,7 +136,14 @@ def image_paths(paths: Iterable[Path]) -> list[Path]:
         raise IngestError(
             f'{bags[0]}: a bag, and the other paths hold images: give only one of the two'
         )
-    return files
+    return [*files]
+
+
+def images_of(paths: Sequence[Path]) -> list[Path]:
+    """`image_paths` of which one is an image; raises IngestError otherwise."""
+    if files := image_paths(paths):
+        return files
+    raise IngestError(f'{paths[0]}: no images')
 
 
 def _is_image(path: Path) -> bool:

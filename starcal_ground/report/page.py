@@ -183,9 +183,6 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     calibration, residuals, pictures = contents.calibration, contents.residuals, contents.pictures
     observations = contents.observations or ()
     prior = products.prior_of(calibration)
-    refused_stars: Counter[str] = Counter()
-    for observed in observations:
-        refused_stars.update(observed.refused_stars)
     written = [
         name
         for name in products.PRODUCT_FILES
@@ -210,7 +207,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'correlation': calibration.correlation,
         'observations': observations,
         'refused_images': Counter(calibration.images_refused).most_common(),
-        'refused_stars': [one for one in refused_stars.most_common() if one[1]],
+        'refused_stars': [*products.refused_stars(observations).items()],
         'model_sentences': verdict.model_sentences(calibration),
         'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
         'pictures': {one.time_ns: one for one in pictures if not one.is_expected},

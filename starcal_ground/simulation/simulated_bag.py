@@ -20,10 +20,10 @@ from scipy.spatial.transform import Rotation
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.comparison import truth_like
+from starcal_ground.mirror import mirrored
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
-from starcal_ground.undistortion import mirrored
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from starcal_ros import opencv as cv2
 from starcal_ros.arrays import AnyArray, Floats, Indices, Pixels
 from starcal_ros.errors import ImageRefused, IngestError, OptionError
 from starcal_ros.formats.image_files import read_image
@@ -54,8 +55,6 @@ class DetectorFrames:
             raise ImageRefused(
                 'bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}'
             )
-        import cv2  # 15 MB, which a calibrator does without
-
         # Clipping noise below the dark level at zero would bias the background.
         below = np.minimum(dark, dark.dtype.type(self.pedestal_dn))
         raised = cv2.add(pixels, dark.dtype.type(self.pedestal_dn) - below)

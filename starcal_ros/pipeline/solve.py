@@ -381,10 +381,14 @@ def inputs_of(
         with errors_as(OptionError, path), regular_file(path) as file:
             while not is_stopped() and (block := file.read(1 << 20)):
                 digest.update(block)
-        # The bytes of a name that is not UTF-8 are written as Python writes them, \\xff.
-        name = os.fsencode(path).decode(errors='backslashreplace')
-        digests[name] = f'sha256:{digest.hexdigest()}'
+        digests[input_name(path)] = f'sha256:{digest.hexdigest()}'
     return digests
+
+
+def input_name(path: Path) -> str:
+    """Name of an input file in a provenance, in Unicode whatever its bytes are."""
+    # Bytes that are not UTF-8 are written as Python writes them, \\xff.
+    return os.fsencode(path).decode(errors='backslashreplace')
 
 
 def _digest(ensemble: Ensemble) -> str:

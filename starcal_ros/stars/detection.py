@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.spatial import cKDTree
 
+from starcal_ros import opencv as cv2
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels, rows_of, Singles
 from starcal_ros.robust_statistics import median, medians
 from starcal_ros.stars.pixel_noise import quantisation_step_dn, rounding_noise_dn
@@ -263,8 +264,6 @@ def _background(
 
 def smooth_mesh(mesh: Singles) -> Singles:
     """Return the mesh after a 3 x 3 median, which removes cells with a bright star."""
-    import cv2  # 15 MB, which a calibrator does without
-
     mesh = np.ascontiguousarray(mesh, np.float32)
     return np.asarray(cv2.medianBlur(mesh, 3), np.float32) if min(mesh.shape) >= 3 else mesh
 
@@ -287,8 +286,6 @@ def detect(
     Local maxima of the background-free image under a Gaussian matched filter; single lit pixels
     (hot pixels, cosmic rays) are left out by their sharpness.  Positions are good to about 0.2 px.
     """
-    import cv2  # 15 MB, which a calibrator does without
-
     height, width = pixels.shape
     # One array of the size of the image: the pages of each further one take as long as the filter.
     image: Any = cv2.resize(background.level_mesh, (width, height))
@@ -357,8 +354,6 @@ def brightest_near(
     The signal-to-noise ratio is 0 where that pixel is not star-like.  Windows must lie 4 px inside
     the image.
     """
-    import cv2  # 15 MB, which a calibrator does without
-
     centre = np.rint(predicted_px).astype(np.int64)
     half = reach_px + _RIM_PX
     windows = windows_about(pixels, centre, half).astype(np.float32)

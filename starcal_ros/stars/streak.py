@@ -18,6 +18,7 @@ import numpy as np
 from scipy.ndimage import label
 from scipy.spatial.transform import Rotation
 
+from starcal_ros import opencv as cv2
 from starcal_ros.arrays import Floats, Indices, Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, rotation_jacobian
 from starcal_ros.errors import ImageRefused
@@ -143,8 +144,6 @@ def _extents(
 
     Also the share (n,) of its window that each fills.
     """
-    import cv2  # 15 MB, which a calibrator does without
-
     centre = np.rint(xy_px).astype(np.int64)
     stamps, outside = detection.stamps_at_edges(pixels, centre, half_px)
     stamps -= background.level_at(centre)[:, None, None]

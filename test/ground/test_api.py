@@ -7,6 +7,7 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
+from mission_files import write_pngs  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -152,6 +153,21 @@ def test_a_bag_gives_what_the_tool_gives(tiny_bag, tiny_products) -> None:
         [tiny_products / 'observations.mcap'], str(tiny_bag / 'params.yaml')
     )
     assert again.stars_used == found.stars_used
+
+
+@pytest.mark.parametrize(
+    ('stated', 'words'),
+    [
+        ({'flip': 'upwards'}, "flip: 'upwards' is not one of left-right, top-bottom"),
+        ({'times': {'other.png': 1}}, r'0\.png.*: not in the table of --times'),
+    ],
+)
+def test_times_and_flip_of_image_files_are_those_of_the_tool(tmp_path, stated, words) -> None:
+    folder = write_pngs(tmp_path / 'night', [np.zeros((8, 8), np.uint8)])
+    with pytest.raises(starcal_ground.StarcalError, match=words):
+        starcal_ground.calibrate_images(folder, **stated)
+    with pytest.raises(starcal_ground.OptionError, match='flip: '):
+        starcal_ground.calibrate_images('bags/tiny', **stated)
 
 
 def test_a_calibration_is_written_and_read(tiny_products, tmp_path) -> None:

@@ -15,8 +15,9 @@ from starcal_ground.products import (
 from starcal_ros.errors import ProductError
 
 RECORD = NotCalibrated(
-    'too few', ('a.mcap', 'b'), {'no_match': 3}, 'clock', ('seen',), ('stamp_offset_s: 3.0',), 'x'
-)
+    'too few', ('a.mcap', 'b'), {'no_match': 3}, 'clock', ('seen',), ('stamp_offset_s: 3.0',), 'x',
+    4, 25, {'faint': 2},
+)  # fmt: skip
 
 
 def test_round_trip_without_older_products(tmp_path) -> None:

@@ -12,9 +12,10 @@ import cv2
 import numpy as np
 import pytest
 
+from starcal_ground.mirror import MIRRORED
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
-from starcal_ground.undistortion import MIRRORED, straight_camera, undistort_file, undistort_maps
+from starcal_ground.undistortion import straight_camera, undistort_file, undistort_maps
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -107,7 +108,9 @@ def test_images_of_any_kind_are_straightened(made, tmp_path, starcal) -> None:
 @pytest.mark.parametrize(
     ('flip', 'read'), [('top-bottom', np.s_[::-1]), ('left-right', np.s_[:, ::-1])]
 )
-def test_mirrored_files_are_mirrored_back(made, tmp_path, flip, read) -> None:
+def test_mirrored_files_are_mirrored_back_and_that_is_said(
+    made, tmp_path, starcal, flip, read
+) -> None:
     """As `starcal calibrate` did, which found that their stars are mirrored."""
     plain = np.random.default_rng(1).integers(0, 255, (512, 640), np.uint8)
     cv2.imwrite(str(tmp_path / 'plain.png'), plain)
@@ -118,3 +121,7 @@ def test_mirrored_files_are_mirrored_back(made, tmp_path, flip, read) -> None:
     undistort_file(tmp_path / 'plain.png', made, maps, tmp_path / 'a.png')
     undistort_file(tmp_path / 'mirrored.png', mirrored, maps, tmp_path / 'b.png')
     assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
+    for calibration, words in ((made, False), (mirrored, True)):
+        write_calibration(calibration, tmp_path / 'calibration.json')
+        said = starcal('undistort', tmp_path, tmp_path / 'plain.png', '-o', tmp_path / 'o').words
+        assert (f'{MIRRORED[flip]}, as the images of the calibration were' in said) is words

@@ -159,6 +159,7 @@ def answer_of(
 
 def print_calibration(calibration: Calibration, prior: CameraGeometry | None) -> None:
     """Print parameters, statistics and causes of the sigma; changes are relative to the prior."""
+    from starcal_ground.products import reasons_in_words
     from starcal_ground.report import verdict
 
     camera = calibration.geometry.camera
@@ -174,9 +175,9 @@ def print_calibration(calibration: Calibration, prior: CameraGeometry | None) ->
     columns = 6 if any(row.change for row in (*rows, *angles)) else 4  # the stars have no prior
     header = ('parameter', 'value', 'unit', '1-sigma', 'from prior', 'in sigmas')
     print_table(header[:columns], [row[:columns] for row in table])
-    refused = ', '.join(f'{n} {reason}' for reason, n in calibration.images_refused.items())
+    refused = reasons_in_words(calibration.images_refused)
     lines = [
-        ('images', f'{calibration.images_used} used, refused: {refused or "none"}'),
+        ('images', f'{calibration.images_used} used, refused: {refused}'),
         ('stars', f'{calibration.stars_used} used, {calibration.stars_rejected} rejected'),
         ('residual', f'{calibration.residual_rms_px:.4f} px rms per axis'),
     ]

@@ -105,6 +105,8 @@ def _topic_notes(topic: TopicContent) -> Iterator[str]:
 
 
 def _image_notes(contents: Contents) -> Iterator[str]:
+    from starcal_ground.products import reasons_in_words
+
     count, chosen = contents.looked_at, contents.chosen
     if not (count and chosen):
         return
@@ -122,10 +124,9 @@ def _image_notes(contents: Contents) -> Iterator[str]:
         first = f'first {_clock(group.first_ns)}: {group.detail}'
         yield f'{group.count} refused as {group.reason}: {group.meaning}; {first}'
     if stars := contents.stars_per_image:
-        refused = [f'{count} {reason}' for reason, count in contents.refused_stars.items()]
         yield (
             f'stars per image: {min(stars)} to {max(stars)}, {sum(stars)} in total; '
-            f'refused: {", ".join(refused) or "none"}'
+            f'refused: {reasons_in_words(contents.refused_stars)}'
         )
 
 

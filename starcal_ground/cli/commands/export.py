@@ -72,7 +72,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import products
-    from starcal_ground.bags.reader import read_observations
+    from starcal_ground.bags.reader import image_files, read_observations
     from starcal_ground.mission.export.spice import SpiceNames
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
@@ -84,11 +84,13 @@ def run(args: argparse.Namespace) -> int:
     products.make_folder(args.output)
     recorded = file.with_name(products.OBSERVATIONS_FILE)
     observations: tuple[StarObservations, ...] = ()
+    names_of_images: dict[int, str] = {}
     if format_named(args.to).needs_observations:
         if not recorded.exists():
             raise OptionError(f'--to {args.to}: needs {recorded} with the stars of the images')
         observations = tuple(read_observations([recorded], products.OBSERVATIONS_TOPIC))
-    asked = Request(names, args.table, observations, args.kernels, args.catalog)
+        names_of_images = image_files([recorded])
+    asked = Request(names, args.table, observations, args.kernels, args.catalog, names_of_images)
     done = export(calibration, args.to, args.output, asked)
     written = ', '.join(str(args.output / name) for name in done.files)
     terminal.print_text(f'written: {written}')

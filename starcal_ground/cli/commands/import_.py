@@ -10,7 +10,7 @@ file to calibrate the bag.
   # FITS and an attitude ephemeris
   starcal import --images 'night/*.fits' --attitude attitude.aem -o bag --camera prior.yaml
   # SPICE kernels for attitude and velocity
-  starcal import --images 'night/*.fits' --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
+  starcal import --images night --attitude ck.bc clk.tsc lsk.tls --star-tracker ST1 -o bag
   # PNG with a table of times and one of attitudes
   starcal import --images 'night/*.png' --times times.csv --attitude attitude.csv -o bag
 """
@@ -28,8 +28,8 @@ from starcal_ros.text import counted
 
 def add_arguments(command: argparse.ArgumentParser) -> None:
     add = command.add_argument
-    what = 'image files; a pattern in quotes is expanded here'
-    add('--images', nargs='+', required=True, metavar='FILE', help=what)
+    what = 'images: files, folders, or patterns in quotes'
+    add('--images', nargs='+', type=arguments.path, required=True, metavar='IMAGE', help=what)
     what = 'AEM, CSV, or SPICE kernels (CK, SCLK, LSK and, for a frame by name, FK)'
     add('--attitude', nargs='+', type=Path, required=True, metavar='FILE', help=what)
     what = 'OEM, CSV, or SPICE kernels (SPK with the Earth or the Sun, LSK); default: the Earth'
@@ -67,6 +67,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.image_series import ImageOptions
+    from starcal_ground.images.photographs import images_of
     from starcal_ground.mission.ingest import mission_records, recording, sources
     from starcal_ros.formats.products.camera_yaml import read_camera_info
     from starcal_ros.pipeline.solve import inputs_of
@@ -80,7 +81,7 @@ def run(args: argparse.Namespace) -> int:
         )
     if args.camera:  # the images take their time
         read_camera_info(args.camera)
-    paths = _expanded(args.images)
+    paths = images_of(args.images)
     inputs = [args.times, args.camera, *args.attitude, *(args.velocity or ())]
     recording.check_place(args.output, [*paths, *filter(None, inputs)], args.camera)
     times = arguments.file_facts(args).times
@@ -126,15 +127,3 @@ def run(args: argparse.Namespace) -> int:
 
 def _names(paths: Sequence[Path]) -> str:
     return ', '.join(map(str, paths))
-
-
-def _expanded(patterns: Sequence[str]) -> list[Path]:
-    """Files of patterns, each once, in order of their names."""
-    from starcal_ground.file_kinds import matching
-
-    files: dict[Path, None] = {}
-    for pattern in patterns:
-        if not (found := matching(Path(pattern))):
-            raise OptionError(f'--images: no file matches {pattern}')
-        files |= dict.fromkeys(found)
-    return list(files)

@@ -27,6 +27,7 @@ import dataclasses
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_text, progress_bar
+from starcal_ground.mirror import MIRRORED
 from starcal_ros.constants import CLOCKS_SET_NS, MAX_STAMP_NS
 from starcal_ros.errors import OptionError
 from starcal_ros.text import counted
@@ -58,7 +59,7 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
     add('--alignment-drift', type=drift, default=0.0, metavar='ARCSEC', help=what)
     add = command.add_argument_group('mistakes to rehearse, see "starcal diagnose"').add_argument
     what = 'mirror the images (default where no side is given: left-right)'
-    flips = arguments.FLIPS
+    flips = tuple(MIRRORED)
     add('--flip', nargs='?', default='', const=flips[0], choices=flips, help=what)
     what = 'angle of a counterclockwise rotation of the images, degrees'
     angles = (0, 90, 180, 270)

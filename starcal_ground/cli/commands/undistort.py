@@ -4,6 +4,7 @@ Write images without the distortion of their calibrated camera.
 
 The images become those of a pinhole camera of the same size, principal point and mean focal
 length, whose camera_info.yaml is written beside them. Colours and bits stay; FITS become TIFF.
+Images are mirrored, with a line that says so, if those of the calibration were.
 
   # photographs of the camera that `starcal calibrate photos -o out` has calibrated
   starcal undistort out photos -o straight
@@ -30,13 +31,12 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import products, undistortion
-    from starcal_ground.images.photographs import image_paths, Refusals
+    from starcal_ground.images.photographs import images_of, Refusals
+    from starcal_ground.mirror import MIRRORED
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     calibration = read_calibration(calibration_file(args.calibration))
-    paths = image_paths(args.images)
-    if not paths:
-        raise IngestError(f'{args.images[0]}: no images')
+    paths = images_of(args.images)
     products.make_folder(args.output)
     outputs = [undistortion.written_to(path, args.output) for path in paths]
     if repeated := next((path for path in outputs if outputs.count(path) > 1), None):
@@ -56,5 +56,7 @@ def run(args: argparse.Namespace) -> int:
         terminal.print_text(line)
     if not written:
         raise IngestError(f'{args.images[0]}: no image of the camera was read')
+    for flip in undistortion.flips_of(calibration):
+        terminal.print_text(f'{MIRRORED[flip]}, as the images of the calibration were')
     terminal.print_text(f'{counted(written, "image")} and {camera.name} written to {args.output}')
     return arguments.EXIT_ACCEPTED

@@ -8,8 +8,8 @@ Help, checks, the interface document and the tests read the rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -29,8 +29,9 @@ class Request:
 
     ``names`` are None where the NAIF ID of the spacecraft is not given; ``table``: only the
     numbers of the calibration, for code that was compiled before; ``observations`` and ``kernels``
-    (LSK and SCLK of the spacecraft) are those of the images; ``catalog`` is the file that
-    identified their stars, None for that of the calibration.
+    (LSK and SCLK of the spacecraft) are those of the images, ``image_files`` the names of their
+    files by stamp, where they are known; ``catalog`` is the file that identified their stars, None
+    for that of the calibration.
     """
 
     names: SpiceNames | None = None
@@ -38,6 +39,7 @@ class Request:
     observations: Sequence[StarObservations] = ()
     kernels: Sequence[Path] = ()
     catalog: Path | None = None
+    image_files: Mapping[int, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,10 @@ SPICE kernels of a calibration: frame (FK), instrument (IK), attitude of each im
 The FK has the camera as a fixed frame (TKFRAME) in the star tracker frame.  The IK has the field
 of view, and the whole camera: lens model, skew and field; nothing is approximated.  The CK, of
 type 3, has the attitude of the calibrated camera by the stars of each image, an interval of its
-own, so that nothing is interpolated from one to the next.  Sources: NAIF's Frames Required Reading
-(TK frames), Kernel Required Reading (text kernels), CK Required Reading (a C-matrix takes inertial
-to frame coordinates) and the specification of GETFOV.
+own, so that nothing is interpolated from one to the next; its comment area describes it.  Sources:
+NAIF's Frames Required Reading (TK frames), Kernel Required Reading (text kernels), CK Required
+Reading (a C-matrix takes inertial to frame coordinates), DAF Required Reading (comment area) and
+the specification of GETFOV.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.camera.detector_field import COSINE_DOMAIN
 from starcal_ros.camera.lens import LENSES
-from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.records import Calibration
 
@@ -40,6 +41,11 @@ if TYPE_CHECKING:
 _LONGEST_NAME = 32  # pool variables and frames: SPICE Required Reading, kernel.req, frames.req
 _COMMENT_COLUMNS = 78  # longer lines are read, but NAIF asks for no more than 80
 _STRING_COLUMNS = 80  # longest string value of a pool variable
+_GEOMETRIC = (
+    'Rotations are geometric and free of stellar aberration: the stars were placed where the'
+    ' velocity of the observer (received, stated, or that of the Earth) shows them, and on the'
+    " ground the air. The camera sees a target at its apparent position (abcorr 'LT+S', 'CN+S')."
+)
 
 Value = int | str | Sequence[float] | Sequence[str]
 _INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
@@ -137,14 +143,14 @@ def _frame_kernel(
     about: list[str],
 ) -> str:
     number = names.camera_id
-    sigmas = ', '.join(f'{sigma:.3f}' for sigma in calibration.sigma[-3:] / ARCSECOND_RAD)
     comments = [
         f'{camera_frame} is fixed in {tracker_frame}. TKFRAME_{number}_Q takes vectors of the',
         'camera frame to the star tracker frame (SPICE quaternion, scalar first).',
         '',
         *exported.PIXEL_CONVENTION,
+        _GEOMETRIC,
         '',
-        f'1-sigma of the alignment about the camera axes, arcsec: {sigmas}.',
+        _alignment_sigma(calibration),
         f'Names of the calibration: {calibration.child_frame} in {calibration.parent_frame}.',
         '',
         *about,
@@ -163,6 +169,11 @@ def _frame_kernel(
     data += _assignments(fixed, f'TKFRAME_{number}_')
     data += ['', f"   NAIF_BODY_NAME += '{camera_frame}'", f'   NAIF_BODY_CODE += {number}']
     return _kernel('FK', f'Frame of the camera {camera_frame}', comments, data)
+
+
+def _alignment_sigma(calibration: Calibration) -> str:
+    sigmas = ', '.join(f'{sigma:.3f}' for sigma in calibration.sigma[-3:] / ARCSECOND_RAD)
+    return f'1-sigma of the alignment about the camera axes, arcsec: {sigmas}.'
 
 
 def _frame(name: str, number: int, kind: int, center: int) -> dict[str, Value]:
@@ -240,6 +251,7 @@ def _lens_values(camera: CameraModel) -> dict[str, Value]:
 def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
     lines = [
         *exported.PIXEL_CONVENTION,
+        _GEOMETRIC,
         '',
         'A direction (X, Y, Z) of the camera frame is seen at pixel (u, v), with',
         'x = X/Z, y = Y/Z, r2 = x^2 + y^2, and LENS_COEFFICIENTS named by LENS_TERMS:',
@@ -277,10 +289,14 @@ def kernel_text(
 
 def _kernel(kind: str, title: str, comments: Iterable[str], data: Iterable[str]) -> str:
     """Text of a kernel of a kind (``FK``, ``IK``): title, comments, assignments."""
-    lines = [f'KPL/{kind}', '', title, '-' * len(title), '']
-    lines += [line for text in comments for line in _wrapped(text)]
+    lines = [f'KPL/{kind}', '', *_titled(title, comments)]
     lines += ['', r'\begindata', '', *data, '', r'\begintext', '']
     return '\n'.join(lines)
+
+
+def _titled(title: str, comments: Iterable[str]) -> list[str]:
+    """Lines of comments under a title."""
+    return [title, '-' * len(title), '', *(line for text in comments for line in _wrapped(text))]
 
 
 def _assignments(values: Mapping[str, Value], prefix: str = '') -> list[str]:
@@ -363,25 +379,53 @@ def ck_of_images(calibration: Calibration, asked: Request) -> exported.Content:
     if names.star_tracker_id:
         icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
     structure = names.star_tracker_id or names.camera_id
+    sigma_px = float(np.median([sigma_px for _, sigma_px in attitudes.values()]))
+    comments = _ck_comments(calibration, names, times_ns, sigma_px)
     q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
     with loaded(asked.kernels) as spice:
         try:
             ticks = np.array(
                 [spice.sce2c(names.spacecraft_id, ephemeris_time(spice, t)) for t in times_ns]
             )
-            data = _ck(spice, structure, ticks, q)
+            data = _ck(spice, structure, ticks, q, comments)
         except spice.SpiceyError as error:
             raise ProductError(f'{CK_FILE}: {short(error)}') from error
-    sigma_px = float(np.median([sigma_px for _, sigma_px in attitudes.values()]))
     loss = exported.Loss('1-sigma of the attitude of an image (median)', sigma_px)
     return exported.Content({CK_FILE: data}, losses=(loss,))
 
 
-def _ck(spice: Any, structure: int, ticks: Floats, q: Floats) -> bytes:
-    """Content of a CK with an interval for each attitude."""
+def _ck_comments(
+    calibration: Calibration, names: SpiceNames, times_ns: Sequence[int], sigma_px: float
+) -> list[str]:
+    """Comment area of a CK of the attitudes of images at some times."""
+    camera = calibration.geometry.camera
+    sigma_arcsec = sigma_px / camera.parameters[0] / ARCSECOND_RAD
+    frame = f'{names.camera_id}, the camera'
+    by_alignment: list[str] = []
+    if names.star_tracker_id:
+        frame = f'{names.star_tracker_id}, the star tracker, by the alignment of the camera'
+        by_alignment = [_alignment_sigma(calibration)]
+    span = f'{utc_text(times_ns[0])} to {utc_text(times_ns[-1])}'
+    comments = [
+        f'C-matrices take vectors of J2000 (axes of the ICRF) to frame {frame}.',
+        f'{len(times_ns)} images, {span}, at the middle of their exposures.',
+        'Type 3, an interval for each image: nothing is interpolated.',
+        'Estimated: a rotation for each image, from its stars and the calibrated camera alone.',
+        f'Median 1-sigma across the boresight: {sigma_px:.3g} px, {sigma_arcsec:.3g} arcsec.',
+        *by_alignment,
+        _GEOMETRIC,
+        '',
+        *exported.origin(calibration),
+    ]
+    return _titled('Attitude of a calibrated camera at each image, by its stars', comments)
+
+
+def _ck(spice: Any, structure: int, ticks: Floats, q: Floats, comments: list[str]) -> bytes:
+    """Content of a CK with an interval for each attitude, and its comment area."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, 'attitude.bc')
-        handle = spice.ckopn(str(path), _INTERNAL_NAME, 0)
+        handle = spice.ckopn(str(path), _INTERNAL_NAME, len('\n'.join(comments)))
+        spice.dafac(handle, comments)
         no_rate = np.zeros((len(ticks), 3))
         spice.ckw03(
             *(handle, ticks[0], ticks[-1], structure, 'J2000', False, 'starcal', len(ticks)),

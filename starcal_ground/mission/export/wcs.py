@@ -9,6 +9,7 @@ the velocity was, and refraction.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 import io
 import json
@@ -21,6 +22,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from starcal_ground.bags.reader import OF_ANOTHER_BAG
 from starcal_ground.mission.export import exported
 from starcal_ground.mission.export.image_attitude import (
     attitude_by_stars,
@@ -33,7 +35,7 @@ from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import needing, ProductError
 from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Calibration, StarObservations
+from starcal_ros.records import Calibration, ORIGINAL, StarObservations
 from starcal_ros.sky.astrometry import julian_year
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
@@ -74,6 +76,11 @@ def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
         header = fits.Header(system.cards())
         if TIMES not in calibration.provenance:  # else the stamps are no times of exposure
             header['DATE-AVG'] = utc_text(image.time_ns).removesuffix(' UTC').replace(' ', 'T')
+        if name := asked.image_files.get(image.time_ns):
+            header['FILENAME'] = exported.ascii_line(Path(name).name), 'image of this header'
+            header['HISTORY'] = exported.ascii_line(f'Coordinates of {name}')
+            if digest := _digest_of(name, calibration.provenance):
+                header['HISTORY'] = digest
         for line in exported.origin(calibration):
             header['COMMENT'] = exported.ascii_line(line)
         memory = io.BytesIO()
@@ -83,6 +90,13 @@ def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
     if not files:
         raise ProductError('--to wcs: no image with stars among the observations')
     return exported.Content(files, worst_px)
+
+
+def _digest_of(name: str, provenance: Mapping[str, str]) -> str:
+    """Digest of an image file; empty without a record, or if two bags have a file of the name."""
+    if f'{ORIGINAL}{name}{OF_ANOTHER_BAG}' in provenance:
+        return ''
+    return provenance.get(f'input {name}', '') or provenance.get(f'{ORIGINAL}{name}', '')
 
 
 def directions_icrf(

@@ -18,12 +18,14 @@ import numpy as np
 
 from starcal_ground import products
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.bags.reader import IMAGE_FILE
 from starcal_ground.images import image_series
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
+from starcal_ros.pipeline.solve import input_name
 from starcal_ros.records import Image, ORIGINAL, PIXELS_OF
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.untrusted import PARAMETER_BYTES
@@ -148,7 +150,9 @@ def write_bag(
     pixels_of = list(dict.fromkeys(file.pixels_of for file in files if file.pixels_of))
     notes += [f'pixels of the images: {words}' for words in pixels_of]
     origin = {PIXELS_OF: '; '.join(pixels_of)} if pixels_of else {}
-    writer = BagWriter(bag, origin | {f'{ORIGINAL}{k}': v for k, v in originals.items()})
+    origin |= {f'{ORIGINAL}{k}': v for k, v in originals.items()}
+    origin |= {f'{IMAGE_FILE}{file.time_ns}': input_name(file.path) for file in files}
+    writer = BagWriter(bag, origin)
     record, params, copied = _files_beside(bag)
     content = {
         'bag': writer.file.name,

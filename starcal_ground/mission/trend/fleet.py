@@ -31,9 +31,10 @@ import numpy as np
 from starcal_ground import file_kinds, products
 from starcal_ground.bags import reader
 from starcal_ground.bags.topics import Topics
-from starcal_ground.campaign import calibrate, chosen, observe, Source
+from starcal_ground.campaign import chosen, observe, Source
 from starcal_ground.images.first_setup import air_of
 from starcal_ground.mission.trend.trend_table import COMPUTED, FAILED, RECORDED, Row, Table
+from starcal_ground.source_diagnosis import calibrated
 from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -299,7 +300,7 @@ def compute(task: Task) -> Row:
                 return row_of(task, RECORDED, read_calibration(path), _observations(path))
             setup = read_setup(Path(task.params))
             source = Source((path,), Topics(), setup, air_of(setup))
-            campaign = calibrate(observe(chosen(source)))
+            campaign = calibrated(observe(chosen(source)))
             return row_of(task, COMPUTED, campaign.calibration, campaign.observations)
     # One bag must not end a run over thousands, whatever is in it.
     except Exception as error:

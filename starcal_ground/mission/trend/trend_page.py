@@ -36,12 +36,6 @@ _FOUND = {  # words of a verdict on terms, and what they ask for; temperature as
     trends.TEMPERATURE: ('effects of temperature on', ''),
 }
 _PER = {trends.DRIFT: ' per year', trends.TEMPERATURE: ' per degC', trends.STEP: ''}
-# Class and headline of a verdict.
-_HEADLINES = {
-    True: ('', '✓ The active calibration holds'),
-    False: (' refused', '✕ The newest calibration differs'),
-    None: (' open', 'Too few calibrations to tell'),
-}
 
 
 @dataclass(frozen=True)
@@ -71,8 +65,11 @@ class Verdict:
 
     @property
     def headline(self) -> tuple[str, str]:
-        """Class and headline on the page."""
-        return _HEADLINES[self.is_stable]
+        """Class and headline on the page: the word, with a tick where nothing needs attention."""
+        if self.attention:
+            return ' refused', f'✕ Needs attention: {self.word}'
+        word = f'{self.word[0].upper()}{self.word[1:]}'
+        return (' open', word) if self.is_stable is None else ('', f'✓ {word}')
 
 
 @dataclass(frozen=True)

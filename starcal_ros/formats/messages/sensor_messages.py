@@ -16,6 +16,7 @@ import zlib
 
 import numpy as np
 
+from starcal_ros import opencv as cv2
 from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import FASTEST_M_S
@@ -173,8 +174,6 @@ def decoded(content: bytes, header: Header | None) -> AnyArray:
             raise ValueError(f'its header claims {sides[0]} x {sides[1]} pixels')
         if png_header(content) and _has_surplus(content, header):
             raise ValueError('inflates to far more than its pixels')
-    import cv2  # slow to import, and few bags have compressed images
-
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

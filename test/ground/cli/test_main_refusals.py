@@ -132,7 +132,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     'simulate -o notes.txt/bag --scenario tiny': ('notes.txt',),
     'import --channel grene': ("'grene'", 'green'),
     'import --images night/0.png --attitude none.csv -o new --camera none.yaml': ('none.yaml',),
-    '{import} *.nothing': ('no file matches',),
+    '{import} *.nothing': ('no such files',),
     '{import} 0.fits --attitude none.aem': ('cannot be read',),
     '{import} 0.fits --attitude a.aem 0.fits': ('one file, unless all are SPICE',),
     '{import} 0.fits --camera a.aem': ('a.aem',),

@@ -21,7 +21,7 @@ from starcal_ground.images.image_series import (
     look,
     pixels_of,
 )
-from starcal_ground.undistortion import MIRRORED
+from starcal_ground.mirror import MIRRORED
 from starcal_ros.errors import IngestError
 
 IMAGE = images()[0]

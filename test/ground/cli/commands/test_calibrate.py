@@ -40,7 +40,7 @@ def test_a_failure_replaces_an_older_calibration(tiny_products, tmp_path, starca
     assert answer.err.endswith(f'; look at {out}/report.html\n')
     record = json.loads((out / NOT_CALIBRATED_FILE).read_text())
     assert (record['calibrated'], record['cause']) == (False, 'attitude_direction')
-    assert record['images_refused'] == {'no_match': 10}
+    assert (record['images_used'], record['images_refused']) == (0, {'no_match': 10})
     assert record['mend'] == ['attitude_direction: st_to_inertial']
     for name in ('calibration.json', 'camera_info.yaml', 'residuals.npz'):
         assert not (out / name).exists()
@@ -49,10 +49,26 @@ def test_a_failure_replaces_an_older_calibration(tiny_products, tmp_path, starca
         assert 'Not calibrated' in page and 'Accepted' not in page
         assert page.count('<figure><img src="data:image/png;base64,') == 3
         assert 'attitude_direction: st_to_inertial' in page
+        assert 'Images: 0 used, refused: 10 no_match' in page
         assert starcal('report', out).status == 0
     assert starcal('calibrate', TINY, '--params', TINY / 'params.yaml', '-o', out).status == 0
     assert not (out / NOT_CALIBRATED_FILE).exists()
     assert 'Accepted' in (out / 'report.html').read_text()
+
+
+@pytest.mark.slow
+def test_a_failure_for_want_of_images_has_the_counts_of_a_calibration(
+    few_images, tmp_path, starcal
+) -> None:
+    command = ['calibrate', few_images, '--params', few_images / 'params.yaml', '-o', tmp_path]
+    answer = starcal(*command, '--set', 'min_images=20')
+    record = json.loads((tmp_path / NOT_CALIBRATED_FILE).read_text())
+    images, stars = record['images_used'], record['stars_used']
+    assert images == 3 and stars > 100 and record['stars_refused']
+    assert '(3 of 20 collected)' in answer.err
+    assert f'(images: {images} used, refused: none; stars: {stars} used, refused: ' in answer.err
+    page = (tmp_path / 'report.html').read_text()
+    assert f'<p>Stars: {stars} used, refused: ' in page
 
 
 @pytest.mark.slow

@@ -244,6 +244,18 @@ def test_spice_has_the_attitude_of_each_image_and_none_between(tmp_path, tracker
         error = (truth.inv() * Rotation.from_matrix(matrix)).as_rotvec()
         assert np.abs(error[:2]).max() < 4 * sigma_rad
         assert abs(error[2]) < 4 * sigma_rad / 0.12  # stars are 0.12 rad from the axis, rms
+    handle = spiceypy.dafopr(str(tmp_path / 'camera.bc'))
+    _, lines, is_whole = spiceypy.dafec(handle, 1000)
+    spiceypy.dafcls(handle)
+    comments = ' '.join(' '.join(lines).split())
+    kernel = ' '.join((tmp_path / 'camera.tf').read_text().split())
+    assert is_whole and max(map(len, lines)) <= 80
+    assert f'(axes of the ICRF) to frame {tracker or -999001}, the ' in comments
+    assert f'across the boresight: {done.losses[0].cost_px:.3g} px, ' in comments
+    assert ('alignment about the camera axes' in comments) == bool(tracker)
+    assert f'catalog: {MADE.provenance["catalog"]}' in comments  # digests are beside it
+    for text in (comments, kernel):  # the rotation was made from apparent directions
+        assert 'free of stellar aberration' in text and "'LT+S'" in text
     between = spiceypy.sce2c(CLOCK_ID, ephemeris_time(FIRST_NS + 5 * 10**9))
     with pytest.raises(spiceypy.NotFoundError):
         spiceypy.ckgp(tracker or -999001, between, 0.0, 'J2000')

@@ -102,7 +102,8 @@ def test_a_ck_has_an_attitude_at_each_image(night, tmp_path, run) -> None:
     kernels = write_ck(tmp_path)
     bag = tmp_path / 'bag.mcap'
     attitude = ['--attitude', *kernels, '--star-tracker', FRAME_ID]
-    assert run(kernels[0], night / '*.fits', bag=bag, more=attitude).status == 0
+    # A folder, and a file of it again.
+    assert run(kernels[0], night, night / '3.fits', bag=bag, more=attitude).status == 0
     topics = Topics('/camera/image_raw', '/star_tracker/attitude')
     held = read_telemetry([bag], topics).attitudes
     for image in images()[1:-1]:
@@ -194,6 +195,8 @@ def test_the_pixels_of_the_camera_are_in_the_record(aem, tmp_path, run) -> None:
     read = list(reader.read_images([tmp_path / 'bag'], '/camera/image_raw'))
     for one, image in zip(read, images(), strict=False):
         assert isinstance(one, Image) and (one.pixels == image.pixels).all()
+    names = {one.time_ns: str(tmp_path / f'{k}.fits') for k, one in enumerate(read)}
+    assert reader.image_files([tmp_path / 'bag']) == names
 
 
 @pytest.mark.slow
@@ -238,6 +241,13 @@ def test_observations_carry_the_originals_of_their_bag(night, tmp_path, run, sta
         assert starcal('calibrate', given, '-o', made, *params).status == 0
         originals = digests_of_originals(starcal_ground.read_calibration(made))
         assert {*originals} == {str(aem), *map(str, night.iterdir())}
+    # Headers of the images name their files, of any generation.
+    headers = tmp_path / 'headers'
+    assert starcal('export', tmp_path / 'again', '--to', 'wcs', '-o', headers).status == 0
+    for name, k in (('image0001.wcs', 9), ('image0010.wcs', 0)):
+        header = fits.getheader(headers / name)
+        assert header['FILENAME'] == f'{k}.fits'
+        assert originals[str(night / f'{k}.fits')] in ''.join(header['HISTORY'])
     # The block for signatures of the report has them.
     assert starcal('report', tmp_path / 'again').status == 0
     page = (tmp_path / 'again' / 'report.html').read_text()

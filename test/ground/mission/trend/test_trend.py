@@ -98,6 +98,8 @@ def test_a_failure_that_a_repaired_camera_file_mends_is_tried_again(
     for words in ('1 failed', '0 failed'):
         status, out, _ = starcal(*line)
         assert status == 3 and words in out
+        assert 'The images are 640 x 512, the prior camera is of 500 x 512' in out
+        assert 'fainter stars' not in out
     camera.write_text(good)
     assert '1 new, 0 known, 0 failed' in starcal(*line).out
     camera.write_text('image_width: wide')

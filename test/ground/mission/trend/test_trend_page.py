@@ -38,6 +38,16 @@ def test_the_verdict_is_open_where_too_few_tell(name) -> None:
     assert verdict.found == f'Steps and drifts need 6 calibrations; there are {len(rows)}.'
     assert verdict.attention == ('changed' if expected is False else '')
     assert verdict.word == {None: 'too few to tell', True: 'sound', False: 'changed'}[expected]
+    headlines = {None: 'Too few to tell', True: '✓ Sound', False: '✕ Needs attention: changed'}
+    assert verdict.headline[1] == headlines[expected]
+
+
+def test_a_drift_is_in_the_headline_of_the_page(tmp_path) -> None:
+    rows = [made(day, (0, 20.0 * day, 0)) for day in range(1, 9)]
+    page = write_page([rows], 1, tmp_path, 'fleet')
+    assert page.verdicts[0].is_stable and page.verdicts[0].word == 'drifting'
+    text = page.path.read_text()
+    assert '<strong>✕ Needs attention: drifting</strong>' in text and '✓' not in text
 
 
 @pytest.mark.parametrize(('count', 'words'), [(5, 'Not tested: 5 of the 6'), (6, 'No change')])
