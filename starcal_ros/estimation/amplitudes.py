@@ -29,7 +29,13 @@ from scipy.special import erf, expit
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.limits import LEAST_GAIN, MOST_CORRELATED, MOST_ROUNDS, ROUNDING
+from starcal_ros.estimation.limits import (
+    LEAST_GAIN,
+    MOST_CORRELATED,
+    MOST_ROUNDS,
+    ROUNDING,
+    ROWS_AT_ONCE,
+)
 
 # Prior of the logarithm of an amplitude: a lens or a detector departs from its model by a
 # micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
@@ -278,7 +284,6 @@ class ShapeSums:
 # of an orbit about the Earth if that is shorter.
 _PER_STEP = 0.9
 _STEP_S = 100.0  # time in which heat loses a tenth
-_AT_ONCE = 8192  # images times trials: with more, memory is slower
 
 
 @dataclass(frozen=True)
@@ -306,7 +311,7 @@ def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
     """Return the amplitudes of the shapes; ``near``: those of the round before."""
     likelihood = _shape_likelihood(sums)
     m, count = sums.gradient.shape
-    best, value = _climb(likelihood, count, _AT_ONCE // max(m, 1), near)
+    best, value = _climb(likelihood, count, ROWS_AT_ONCE // max(m, 1), near)
     none = np.full(len(best), math.log(LEAST_PX))
     prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
     ratio = 2.0 * (value - float(likelihood(none[None])[0])) + float(prior)
@@ -348,7 +353,7 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
     def likelihood(log_px: Floats) -> Floats:
         k, s = len(log_px), np.exp(log_px)
         shown = np.flatnonzero(s**2 @ total > LEAST_GAIN)
-        if k > 1 and len(shown) * m > _AT_ONCE:  # more at once is slower: memory
+        if k > 1 and len(shown) * m > ROWS_AT_ONCE:
             return np.concatenate([likelihood(log_px[: k // 2]), likelihood(log_px[k // 2 :])])
         left, log_det = np.tile(whole, (k, 1, 1)), np.zeros(k)
         size2 = (s[shown, :, None] * s[shown, None, :])[:, None]

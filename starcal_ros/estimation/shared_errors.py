@@ -41,10 +41,10 @@ from starcal_ros.estimation.amplitudes import (
     OCTAVE_STEP,
 )
 from starcal_ros.estimation.limits import MOST_ROUNDS, NEGLIGIBLE, ROUNDING
+from starcal_ros.estimation.unknowns import FIELD_OCTAVES
 
-# Wavelengths below those of the field, as fractions of the width: each octave is seen in cells of
-# a sixth of its longest wave, over which it keeps nine tenths of its correlation.
-_FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
+# An octave is seen in cells of a sixth of its longest wave, over which it keeps nine tenths of its
+# correlation.
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
 _TAIL = 2.0  # degrees of freedom of the errors of stars
@@ -118,19 +118,25 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     """
     Return the groups of observations at pixels (n, 2) of stars (n,) on a detector of a width, px.
 
-    The stars, and the cells of the fine octaves, from the coarsest of a 24th of the width.
+    The stars, and the cells of the octaves of waves that are too short for the field.
     """
     found = [Groups('star places', star, None, _together(pixels, star, width))]
-    for wave in _FINE_OCTAVES:
-        cells = _cells(pixels, wave / _FINE_OCTAVES[0] * coarsest_cell_px(width))
-        name = f'field at 1/{round(1 / wave)} of the width'
+    for wave_px in _fine_waves_px(width):
+        cells = _cells(pixels, wave_px / _CELLS_PER_WAVE)
+        name = f'field at 1/{round(width / wave_px)} of the width'
         found.append(Groups(name, cells, pairs_of(cells, star)))
     return tuple(found)
 
 
+def _fine_waves_px(width: int) -> list[float]:
+    """Return the longest waves of the octaves below those of the field, as many as it has."""
+    shortest_px = width / 2 ** (FIELD_OCTAVES - 1)
+    return [shortest_px / 2**k for k in range(FIELD_OCTAVES)]
+
+
 def coarsest_cell_px(width: int) -> float:
     """Return the side of the largest cells: over it, no wave of the field changes much."""
-    return _FINE_OCTAVES[0] * width / _CELLS_PER_WAVE
+    return _fine_waves_px(width)[0] / _CELLS_PER_WAVE
 
 
 def _together(pixels: Floats, star: Indices, width: int) -> Floats:
@@ -138,7 +144,7 @@ def _together(pixels: Floats, star: Indices, width: int) -> Floats:
     sightings = np.bincount(star)[star]
     off = [pixel - np.bincount(star, pixel)[star] / sightings for pixel in pixels.T]
     spread_px2 = np.bincount(star, off[0] ** 2 + off[1] ** 2)[star] / sightings
-    usual_px = _FINE_OCTAVES[0] * width / (2.0 * math.pi * math.sqrt(2.0))
+    usual_px = _fine_waves_px(width)[0] / (2.0 * math.pi * math.sqrt(2.0))
     return np.asarray(np.exp(-spread_px2 / usual_px**2))
 
 
