@@ -22,7 +22,7 @@ from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.amplitudes import STARTS_PX, UNSTATED
+from starcal_ros.estimation.amplitudes import LogPrior, STARTS_PX
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, STEP_SIGMA
@@ -339,9 +339,9 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
         'unknown': (0.0, _UNKNOWN_READOUT_S),
     }
     readout = readout_s[options.shutter]
-    lens, refraction = UNSTATED, None
+    lens, refraction = LogPrior(), None
     if options.lens_residual_px:
-        lens = math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA
+        lens = LogPrior(math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA)
     zenith = np.array([image.zenith_icrf for image in ensemble.images])
     is_known = np.isfinite(zenith).all(axis=1)
     if is_known.any():  # where none is stated, as in older recordings, the air turns no star

@@ -25,8 +25,7 @@ from starcal_ros.estimation.amplitudes import (
     averaged_field,
     field_amplitudes,
     LEAST_PX,
-    LOG_CENTRE,
-    LOG_SIGMA,
+    LogPrior,
     Shapes,
     shapes,
     ShapeSums,
@@ -162,7 +161,7 @@ def posterior(
     log_evidence += 0.5 * float((last.own * normal.c).sum())
     log_px = np.log(found.sigma_px)
     log_evidence -= len(normal.c) * float(log_px.sum())
-    log_evidence -= 0.5 * float((((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2).sum())
+    log_evidence += float(LogPrior().log_density(log_px).sum())
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,

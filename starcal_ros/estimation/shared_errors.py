@@ -35,8 +35,7 @@ from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
     log_amplitudes,
-    LOG_CENTRE,
-    LOG_SIGMA,
+    LogPrior,
     OCTAVE_SIGMA,
     OCTAVE_STEP,
 )
@@ -49,7 +48,7 @@ _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _LOG_GRID = log_amplitudes(LARGEST_FIELD_PX)
-_PRIOR: Floats = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
+_PRIOR: Floats = np.exp(LogPrior().log_density(_LOG_GRID))
 
 
 @dataclass(frozen=True)

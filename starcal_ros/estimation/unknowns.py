@@ -33,7 +33,7 @@ from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD, FASTEST_M_S, SPEED_OF_LIGHT_M_S
-from starcal_ros.estimation.amplitudes import UNSTATED
+from starcal_ros.estimation.amplitudes import LogPrior
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import (
     image_alignment,
@@ -102,8 +102,8 @@ class Unknown:
         Sums (k, t, t) of their products over pixels (2, n) with weights (k, n).
     octave : (q,) or None
         Octave of each coefficient of those functions.
-    log_px : float, float
-        Prior of the logarithm of the amplitude of the first octave: mean and 1-sigma.
+    log_px : LogPrior
+        Prior of the amplitude of the first octave.
     term : (q,) or None
         A likely combination of the functions, 1 px, with an amplitude of its own besides.
     tracker : (m, 3, q) or None
@@ -125,7 +125,7 @@ class Unknown:
     functions: Scalars | None = None
     products: Callable[[Floats, Floats], Floats] | None = None
     octave: Indices | None = None
-    log_px: tuple[float, float] = UNSTATED
+    log_px: LogPrior = dataclasses.field(default_factory=LogPrior)
     term: Floats | None = None
     tracker: Floats | None = None
     widest: Floats | float = np.inf
@@ -267,8 +267,8 @@ class Assumptions:
         Offset of all stamps against the attitudes.
     refraction : Refraction or None
         About a zenith that is not known exactly; None: in space, or corrected.
-    lens_log_px : float, float
-        Logarithm of the residual of the lens: mean and 1-sigma.
+    lens_log_px : LogPrior
+        Prior of the residual of the lens.
     plausible_m_s : float
         Plausible velocity against the Earth where none is given.
     colour : (n,) or None
@@ -279,7 +279,7 @@ class Assumptions:
     readout_s: tuple[float, float]
     stamp_s: float
     refraction: Refraction | None = None
-    lens_log_px: tuple[float, float] = UNSTATED
+    lens_log_px: LogPrior = dataclasses.field(default_factory=LogPrior)
     plausible_m_s: float = np.inf
     colour: Floats | None = None
 
