@@ -55,7 +55,7 @@ from starcal_ros.estimation.star_equations import (
     turned,
 )
 from starcal_ros.estimation.tracker_errors import (
-    Attitudes,
+    AttitudeErrors,
     measured_rates,
     star_tracker_alignments,
 )
@@ -140,7 +140,7 @@ class Estimate:
         Stars that misfit across images and were left out of all.
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
-    attitudes : Attitudes
+    attitudes : AttitudeErrors
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
@@ -169,7 +169,7 @@ class Estimate:
     misfit_image: Mask
     dropped_catalog_id: NDArray[np.int64]
     alignment_scatter_arcsec: float
-    attitudes: Attitudes
+    attitudes: AttitudeErrors
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
@@ -288,7 +288,7 @@ class _Round:
     after: State
     residual_px: Floats
     freedom: Floats
-    attitudes: Attitudes
+    attitudes: AttitudeErrors
 
 
 def _round(

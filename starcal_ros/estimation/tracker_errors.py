@@ -388,7 +388,7 @@ def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:
 
 
 @dataclass(frozen=True)
-class Attitudes:
+class AttitudeErrors:
     """Errors of the star trackers as the stars show them, and their variances."""
 
     error_rad: Floats
@@ -403,7 +403,7 @@ def star_tracker_alignments(
     problem: Problem,
     state: State,
     covariance: Floats,
-    attitudes: Attitudes,
+    attitudes: AttitudeErrors,
     time_ns: Indices,
     sigma_rad: Floats,
 ) -> tuple[StarTrackerAlignment, ...]:
@@ -416,7 +416,7 @@ def star_tracker_alignments(
         From `star_tracker_names`.
     covariance : (3 + 3 s, 3 + 3 s)
         Covariance of the alignment and of the mountings of the s further star trackers.
-    attitudes : Attitudes
+    attitudes : AttitudeErrors
         Errors in images at ``time_ns`` (m,), about the axes of the star tracker of each.
     sigma_rad : (3,)
         Noise of a star tracker.
@@ -451,7 +451,7 @@ def star_tracker_alignments(
 
 
 def _drift(
-    time_ns: Indices, attitudes: Attitudes, sigma_rad: Floats, here: Mask
+    time_ns: Indices, attitudes: AttitudeErrors, sigma_rad: Floats, here: Mask
 ) -> tuple[Floats, float, float]:
     """
     Slope (3,) of the errors in time, arcsec/h; its length over the span; p-value of none.

@@ -398,7 +398,7 @@ def moved(
 
 
 @dataclass(frozen=True)
-class Given:
+class EntryInputs:
     """Inputs of the entries: rates in the frame of the camera, size of the detector, px."""
 
     problem: Problem
@@ -430,7 +430,7 @@ def unknowns_of(
     size : (width, height)
         Of the detector, px.
     """
-    given = Given(problem, state, rates, size, assumed)
+    given = EntryInputs(problem, state, rates, size, assumed)
     made = (kind.make(given) for kind in UNKNOWNS.values() if kind.make is not None)
     entries = *unknowns_in_state(problem, state).entries, *made
     return Layout(tuple(entry for entry in entries if entry is not None and len(entry)))
@@ -457,7 +457,7 @@ def readout_rms_s(layout: Layout, mean: Floats, covariance: Floats, assumed: Ass
     return math.hypot(mean[at], covariance[at, at] ** 0.5)
 
 
-def _shape(given: Given) -> Unknown:
+def _shape(given: EntryInputs) -> Unknown:
     """
     Return the entry of the changes of the camera from image to image.
 
@@ -477,7 +477,7 @@ def _shape(given: Given) -> Unknown:
     return Unknown('shape', labels, np.ones(count), np.zeros(count), of_image=True, camera=camera)
 
 
-def _trend(given: Given) -> Unknown | None:
+def _trend(given: EntryInputs) -> Unknown | None:
     """
     Return the entry of a scale that changes in proportion to time, as that of a lens that warms.
 
@@ -494,7 +494,7 @@ def _trend(given: Given) -> Unknown | None:
     return Unknown('trend', ('scale_trend_px',), sigma, np.zeros(1), camera=modes)
 
 
-def _velocity(given: Given) -> Unknown | None:
+def _velocity(given: EntryInputs) -> Unknown | None:
     """Return the entry of the velocity of the observer."""
     if not given.assumed.velocity_m_s > 0:
         return None
@@ -509,7 +509,7 @@ def _velocity(given: Given) -> Unknown | None:
     )
 
 
-def _refraction(given: Given) -> Unknown | None:
+def _refraction(given: EntryInputs) -> Unknown | None:
     """Return the entry of the size of refraction."""
     if (air := given.assumed.refraction) is None:
         return None
@@ -518,7 +518,7 @@ def _refraction(given: Given) -> Unknown | None:
     return Unknown('refraction', label, sigma, np.zeros(1), turn=turn)
 
 
-def _site(given: Given) -> Unknown | None:
+def _site(given: EntryInputs) -> Unknown | None:
     """Return the entry of latitude and sidereal times."""
     if (air := given.assumed.refraction) is None:
         return None
@@ -527,7 +527,7 @@ def _site(given: Given) -> Unknown | None:
     return Unknown('site', air.labels, sigma, np.zeros(q), turn=turn, widest=ZENITH_SIGMA_RAD)
 
 
-def _colour(given: Given) -> Unknown | None:
+def _colour(given: EntryInputs) -> Unknown | None:
     """Return the entry of a scale that changes with the colour of the star."""
     if given.assumed.colour is None:
         return None
@@ -536,21 +536,21 @@ def _colour(given: Given) -> Unknown | None:
     return Unknown('colour', label, sigma, np.zeros(1), turn=turn, of_star=given.assumed.colour)
 
 
-def _readout(given: Given) -> Unknown | None:
+def _readout(given: EntryInputs) -> Unknown | None:
     """Return the entry of the time of read-out, which a camera that turns shows."""
     labels, sigma, offset, by_time = _timing(given, 'readout', *given.assumed.readout_s)
     turn = functools.partial(_by_readout, by_time, given.size[1])
     return Unknown('readout', labels, sigma, offset, turn=turn)
 
 
-def _stamps(given: Given) -> Unknown | None:
+def _stamps(given: EntryInputs) -> Unknown | None:
     """Return the entry of the offset of the stamps, which a camera that turns shows."""
     labels, sigma, offset, by_time = _timing(given, 'stamp_offset', 0.0, given.assumed.stamp_s)
     return Unknown('stamps', labels, sigma, offset, tracker=by_time)
 
 
 def _timing(
-    given: Given, name: str, mean_s: float, sigma_s: float
+    given: EntryInputs, name: str, mean_s: float, sigma_s: float
 ) -> tuple[tuple[str, ...], Floats, Floats, Floats]:
     """
     Return labels, 1-sigma (q,), offset (q,) and turns (m, 3, q) of a time that is not known.
@@ -571,7 +571,7 @@ def _timing(
     return labels, sigma_s * one, -mean_s * one, by_time
 
 
-def _errors_of_rates(given: Given) -> Unknown | None:
+def _errors_of_rates(given: EntryInputs) -> Unknown | None:
     """
     Return the entry of the errors of the rates: three turns of each image over its read-out.
 
@@ -621,7 +621,7 @@ def _by_readout(
     return np.asarray(np.take(turns.transpose(1, 2, 0), image, axis=2) * late)
 
 
-def _field(given: Given) -> Unknown:
+def _field(given: EntryInputs) -> Unknown:
     """
     Return the entry of the field over the detector: coefficients of cosines.
 
@@ -727,7 +727,7 @@ class Kind:
         None: the data do not test its prior.
     """
 
-    make: Callable[[Given], Unknown | None] | None = None
+    make: Callable[[EntryInputs], Unknown | None] | None = None
     cause: str = ''
     line: int = 9
     of_tracker: bool = False

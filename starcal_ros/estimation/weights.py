@@ -51,7 +51,7 @@ from starcal_ros.estimation.shared_errors import (
 )
 from starcal_ros.estimation.star_equations import ROTATION, StarTable, turned, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
-    Attitudes,
+    AttitudeErrors,
     correlations_of,
     Rates,
     tracker_errors,
@@ -222,7 +222,7 @@ class Weighting:
     variance: CentroidVariance
     errors: tuple[SharedError, ...]
     kept: Mask
-    attitudes: Attitudes | None
+    attitudes: AttitudeErrors | None
 
     def covariance_px2(self, table: StarTable) -> Floats:
         """Return the covariances (n, 3) of the observations."""
@@ -246,7 +246,7 @@ class Weighting:
 
 
 def weighted_attitudes(
-    problem: Problem, data: Data, attitudes: Attitudes | None, state: State
+    problem: Problem, data: Data, attitudes: AttitudeErrors | None, state: State
 ) -> Problem:
     """
     Return the problem with the working sigmas of the star trackers.
@@ -303,8 +303,8 @@ def tracker_attitudes(
     sums: StarSums,
     found: Posterior,
     after: State,
-    before: Attitudes | None,
-) -> Attitudes:
+    before: AttitudeErrors | None,
+) -> AttitudeErrors:
     """
     Return the errors of the star trackers as the stars alone show them, at the state ``after``.
 
@@ -328,7 +328,7 @@ def tracker_attitudes(
             group, working = np.zeros(len(images), np.int64), EXACT_RAD / stated[0]
             exact = TrackerErrors(1.0, 0.0, np.eye(1), group, working, 0.0, '', 1.0)
             trackers.append(dataclasses.replace(exact, sigma_rad=stated[0], images=images))
-        return Attitudes(error, covariance, seen, np.zeros(m, bool), tuple(trackers))
+        return AttitudeErrors(error, covariance, seen, np.zeros(m, bool), tuple(trackers))
     is_stated = tracker_sigma_is_given(data.options)
     misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, is_stated)
     known_trackers = before.trackers if before else ()
@@ -361,7 +361,7 @@ def tracker_attitudes(
                     correlations=correlations,
                 )
             )
-    return Attitudes(error, covariance, seen, misfit, tuple(trackers))
+    return AttitudeErrors(error, covariance, seen, misfit, tuple(trackers))
 
 
 def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Floats, Mask]:
@@ -419,7 +419,7 @@ def judge(
     freedom: Floats,
     before: Weighting,
     found: Posterior | None,
-    attitudes: Attitudes | None = None,
+    attitudes: AttitudeErrors | None = None,
 ) -> Weighting:
     """
     Return the weights that the residuals of a state ask for.

@@ -30,7 +30,7 @@ from starcal_ros.estimation.options import CalibrationOptions, check_enough, est
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.estimation.shared_errors import SharedError
 from starcal_ros.estimation.star_equations import star_table
-from starcal_ros.estimation.tracker_errors import Attitudes
+from starcal_ros.estimation.tracker_errors import AttitudeErrors
 from starcal_ros.estimation.weights import CentroidVariance
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from studies import worlds
@@ -352,7 +352,7 @@ def test_a_variance_that_moves_no_weight_holds_nothing_up() -> None:
     kept = np.ones(len(table), bool)
     seen: Mask = np.ones(table.image_count, bool)
     none = np.zeros((table.image_count, 3))
-    attitudes = Attitudes(none, np.zeros((len(none), 3, 3)), seen, ~seen, ())
+    attitudes = AttitudeErrors(none, np.zeros((len(none), 3, 3)), seen, ~seen, ())
 
     def judged(variance_px2: float, stars: Indices) -> weights.Weighting:
         share_px2 = np.full(len(stars), variance_px2)

@@ -47,7 +47,7 @@ from starcal_ros.estimation.problem import attitude_errors
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import (
     Assumptions,
-    Given,
+    EntryInputs,
     Kind,
     Layout,
     moved,
@@ -357,7 +357,7 @@ TRUE_ARCSEC = 2.0  # at 90 degrees five hundred times the Sun's: a few images sh
 def row(sigma_arcsec: float) -> Kind:
     """The deflection of light by a mass: stars move away from it."""
 
-    def make(given: Given) -> Unknown:
+    def make(given: EntryInputs) -> Unknown:
         def turn(_: Floats, directions: Floats, image: Indices) -> Floats:
             mass = np.einsum('mij,j->im', given.camera_from_icrf, MASS_ICRF)[:, image]
             turns = np.cross(directions, mass, axis=0) / (1.0 - (mass * directions).sum(axis=0))
