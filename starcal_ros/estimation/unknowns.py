@@ -719,6 +719,8 @@ class Kind:
         Text of that line by the list, the posterior mean (P,) and the options.
     option : callable
         What may be stated to lower the sigma, by the list and the options.
+    needs_dates : bool
+        True if a statement of it takes effect only in images that have a date.
     remedy : str
         What else lowers it.
     in_state : bool
@@ -735,6 +737,7 @@ class Kind:
         'estimated, no prior'
     )
     option: Callable[[Layout, CalibrationOptions], Option] = lambda *_: NO_OPTION
+    needs_dates: bool = False
     remedy: str = ''
     in_state: bool = False
     tested: PriorTest | None = None
@@ -856,6 +859,7 @@ UNKNOWNS: dict[str, Kind] = {
         cause='refraction',
         line=2,
         option=_site_option,
+        needs_dates=True,
         tested=PriorTest(
             ('latitude', 'clock'),
             'check site and UTC, or state observer: ground alone',
