@@ -24,6 +24,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.amplitudes import LogPrior, STARTS_PX
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
+from starcal_ros.estimation.image_rotations import sky_rotations, turned
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, STEP_SIGMA
 from starcal_ros.estimation.options import (
@@ -52,7 +53,6 @@ from starcal_ros.estimation.star_equations import (
     squared_sigmas,
     star_table,
     StarTable,
-    turned,
 )
 from starcal_ros.estimation.tracker_errors import (
     AttitudeErrors,
@@ -74,7 +74,6 @@ from starcal_ros.estimation.weights import (
     degrees_of_freedom,
     has_converged,
     judge,
-    sky_rotations,
     tracker_attitudes,
     weighted_attitudes,
     Weighting,

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.camera import CameraModel, rotation_jacobian
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.equations import (
     chain,
@@ -49,7 +48,7 @@ from starcal_ros.estimation.shared_errors import (
     SharedError,
     star_shares_px2,
 )
-from starcal_ros.estimation.star_equations import ROTATION, StarTable, turned, whitened_chunks
+from starcal_ros.estimation.star_equations import ROTATION, StarTable, whitened_chunks
 from starcal_ros.estimation.tracker_errors import (
     AttitudeErrors,
     correlations_of,
@@ -384,32 +383,6 @@ def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Float
     covariance[seen] = np.linalg.inv(scaled[seen])
     covariance *= scale[:, :, None] * scale[:, None, :]
     return np.einsum('mij,mj->mi', covariance, c), covariance, seen
-
-
-def sky_rotations(state: State, table: StarTable, camera: CameraModel) -> Floats:
-    """
-    Rotations (n, 2, 2) of displacements fixed to a star into pixel axes.
-
-    The rotation part of the derivative of the pixel by the place of the star.
-    """
-    e = table.direction_icrf
-    along: Floats = np.asarray(np.cross(e, [0.1, 0.2, 0.97]))
-    along /= np.linalg.norm(along, axis=1)[:, None]
-    rotations = state.camera_from_icrf.as_matrix()
-    in_camera = turned(rotations, table.image, e)
-    J = rotation_jacobian(
-        dataclasses.replace(camera, parameters=state.parameters, field=None), in_camera
-    )
-    columns = [
-        np.einsum('nab,nb->na', J, np.cross(turned(rotations, table.image, axis), in_camera))
-        for axis in (along, np.asarray(np.cross(e, along)))
-    ]
-    M = np.stack(columns, axis=2)
-    # A mirrored pair of axes is the same for all stars: the sky's second axis is turned over.
-    M[..., 1] *= np.sign(M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0])[:, None]
-    angle = np.arctan2(M[:, 1, 0] - M[:, 0, 1], M[:, 0, 0] + M[:, 1, 1])
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([cos, -sin], axis=1), np.stack([sin, cos], axis=1)], axis=1)
 
 
 def judge(
