@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import (
     common_rotation,
-    GRID,
     grid_derivatives,
     line_of_sight_table,
-    movement,
     sigma_arcsec,
 )
 from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
@@ -250,19 +248,6 @@ def map_sigma_px(camera: CameraModel, covariance: MapCovariance) -> Floats:
     J = grid.of_shape(camera, common_rotation(camera, grid))
     shape_sigma_arcsec = sigma_arcsec(grid.covariance_rad2(covariance, J))
     return np.asarray(shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
-
-
-def map_error_px(found: CameraModel, true: CameraModel) -> float:
-    """
-    RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
-
-    The best common rotation is removed, because a calibration assigns it to the alignment.
-    Infinite if a pixel has no line of sight, where the distortion folds.
-    """
-    unturned = np.array([0.0, 0.0, 0.0, 1.0])
-    before, after = CameraGeometry(found, unturned), CameraGeometry(true, unturned)
-    _, left_px = movement(before, after, GRID, GRID)
-    return float(np.sqrt(np.mean(left_px**2)))
 
 
 def detector_maps(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> DetectorMaps:
