@@ -243,16 +243,17 @@ class _Solver:
         self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
         self.first = field.log_px
 
-    def _of_free(self, arrow: Equations) -> tuple[Floats, Floats]:
-        """Return the covariance of all but the field, the field known, and their gradient."""
-        information = arrow.information[np.ix_(self.free, self.free)]
-        information = information + np.diag(self.precision[self.free])
-        offset = self.precision[self.free] * self.layout.prior_offset[self.free]
-        return inverse(information), arrow.gradient[self.free] - offset
-
     def _of_field(self, arrow: Equations) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return information and gradient of the field in its unit, and the eliminated part."""
-        free, gradient = self._of_free(arrow)
+        """
+        Return information and gradient of the field in its unit, and the eliminated part.
+
+        That is the covariance of all but the field, the field known, their gradient, and how they
+        follow the field.
+        """
+        of_free = arrow.information[np.ix_(self.free, self.free)]
+        free = inverse(of_free + np.diag(self.precision[self.free]))
+        offset = self.precision[self.free] * self.layout.prior_offset[self.free]
+        gradient = arrow.gradient[self.free] - offset
         cross = arrow.information[np.ix_(self.free, self.field)] * self.unit
         back = free @ cross
         own = arrow.information[np.ix_(self.field, self.field)] * np.outer(self.unit, self.unit)
@@ -437,9 +438,9 @@ def _of_observations(
     found: Posterior, linear: Linearisation, weights: Weights, root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """
-    Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, the images eliminated.
+    Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, and the errors that they share.
 
-    With the whole variance of each error that they share.
+    The images are eliminated.  Each error is the whole variance (r, r) by it.
     """
     rows = weighted_rows_by(linear, root, -found.equations.back @ root)
     whole, own = group_sums(
