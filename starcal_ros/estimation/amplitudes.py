@@ -23,6 +23,7 @@ import functools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import brentq
 from scipy.special import erf, expit
@@ -64,7 +65,7 @@ class LogPrior:
     centre: float = math.log(1e-5)
     sigma: float = 4.0
 
-    def log_density(self, log_amplitude: Floats) -> Floats:
+    def log_density(self, log_amplitude: NDArray[np.floating]) -> Floats:
         """Return the log density (...) at logarithms (...), up to a constant."""
         return np.asarray(-0.5 * ((log_amplitude - self.centre) / self.sigma) ** 2)
 
@@ -289,8 +290,8 @@ class ShapeSums:
     time_s: Floats = field(default_factory=lambda: np.empty(0))
 
 
-# Correlation of the shapes of images a step apart: heat decays so in ten images, or in a quarter
-# of an orbit about the Earth if that is shorter.
+# Correlation of the shapes of images one step apart: a lens warms or cools within ten images, or
+# within a quarter of an orbit about the Earth if that is shorter.
 _PER_STEP = 0.9
 _STEP_S = 100.0  # time in which heat loses a tenth
 
