@@ -309,7 +309,7 @@ def _estimated(rms_px: float, likelihood_ratio: float) -> str:
 
 
 def _field_px(estimate: Estimate) -> float:
-    """Return the RMS of the field over the detector, what is not known of it included."""
+    """Return the RMS of the field over the detector, its uncertainty included."""
     place = estimate.linear.layout.field_at
     square = estimate.posterior.mean[place] ** 2 + np.diag(estimate.posterior.covariance)[place]
     return math.sqrt(0.5 * float(square.sum()))

@@ -26,7 +26,7 @@ from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
 _STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
-_MARGIN = 0.1  # of the sides, where lenses leave residuals that look like steps: WISPR 0.25 px
+_MARGIN = 0.1  # ends of a side, as a share of it: lenses leave 0.25 px there that look like steps
 
 
 def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:

@@ -137,8 +137,8 @@ def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
 
     Lens coefficients by their displacement of a corner: without a prior, those of a numerator and
     a denominator run into a pole on the detector.  The series of a lens is in the angle from its
-    axis: in a narrow field each order is smaller than the one before, and not for its stars to
-    show.
+    axis: in a narrow field each order is smaller than the one before, and the stars do not show
+    it.
     """
     corner = 0.5 * np.array([camera.width, camera.height]) / camera.parameters[0]
     none = np.zeros(len(LENSES[camera.model].coefficients))

@@ -220,10 +220,10 @@ def _of_stars(
     on_sky: Floats, weight: Floats, variance_px2: Floats, star: Indices
 ) -> tuple[float, float, float, Floats]:
     """
-    Return ``c^2``, px^2, and rho of the sightings of stars, and twice their log likelihood ratio.
+    Return ``c^2``, px^2, rho, twice their log likelihood ratio, and the likelihood (g,) of c.
 
-    And the likelihood (g,) of c.  Posterior means: products of pairs of residuals on the sky are
-    fitted by 1 and by the product of their sigmas over that of a usual star.
+    ``c^2`` and rho of the sightings of stars are posterior means: products of pairs of residuals
+    on the sky are fitted by 1 and by the product of their sigmas over that of a usual star.
     """
     usual_px2 = float(np.median(variance_px2[weight > 0]))
     root = weight * np.sqrt(variance_px2 / usual_px2)
@@ -396,9 +396,10 @@ def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
 
 def star_shares_px2(errors: Sequence[SharedError]) -> tuple[Floats | float, Floats | float]:
     """
-    Variance (n,) per axis that sightings of a star share; 0 where it changes no precision.
+    Variance (n,) per axis that sightings of a star share, and the part (n,) of that one star.
 
-    And the part (n,) of it by which a star differs from others of its brightness.
+    That part is the difference from other stars of its brightness.  Both are 0 where they change
+    no precision.
     """
     shares = [(one.share_px2, one.beyond_px2) for one in errors if one.of_star and one.matters]
     return shares[0] if shares else (0.0, 0.0)

@@ -61,7 +61,9 @@ from starcal_ros.records import CameraGeometry
 
 EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
-_NODES = 5  # nodes of the factor as a function of magnitude, at quantiles
+# Nodes of the factor as a function of magnitude, at quantiles.  Without that function, halves of
+# two real sets differ by 1.19 and 1.92 of their sigma, with it by 1.01 and 1.75.
+_NODES = 5
 _BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
 _NODE_SIGMA = 0.5  # prior 1-sigma of a log factor: cores and wings of bright stars
 _LEAST_FREEDOM = 0.1  # floor of the freedom of two axes: one star of few keeps none
