@@ -26,7 +26,7 @@ from starcal_ros.estimation.problem import Problem, State, supported_terms
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
-from starcal_ros.estimation.unknowns import unknowns_in_state
+from starcal_ros.estimation.unknowns import Layout, unknowns_in_state
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
@@ -72,8 +72,7 @@ def image_information(
     order, with_rate, _ = supported_terms(
         ensemble, options.focal_temperature_order, options.alignment_temperature
     )
-    problem, state, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
-    layout = unknowns_in_state(problem, state)
+    problem, state, layout, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
     kept = estimated(layout)
     information = information_of_images(sums, problem, state, layout)
     seen = np.asarray(sums.blocks.any(axis=(1, 2)))
@@ -121,8 +120,12 @@ def _at_the_prior(
     options: CalibrationOptions,
     order: int,
     with_rate: bool,
-) -> tuple[Problem, State, StarSums, bool]:
-    """Problem, initial state, sums over the stars, and True if all stars are before the camera."""
+) -> tuple[Problem, State, Layout, StarSums, bool]:
+    """
+    Return the initial state of a problem, its unknowns and the sums over its stars.
+
+    The last value is True if all stars are in front of the camera.
+    """
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
@@ -130,7 +133,7 @@ def _at_the_prior(
     measurements = arrange(table, enough[table.image], table.covariance_px2)
     layout = unknowns_in_state(problem, state)
     cost, sums = stars_alone(problem, state, layout, measurements)
-    return problem, state, sums, math.isfinite(cost)
+    return problem, state, layout, sums, math.isfinite(cost)
 
 
 def _sigma_with(
@@ -141,10 +144,11 @@ def _sigma_with(
     with_rate: bool,
 ) -> dict[str, float]:
     """1-sigma by name; empty if not observable."""
-    problem, state, sums, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
+    problem, state, layout, sums, in_front = _at_the_prior(
+        ensemble, prior, options, order, with_rate
+    )
     if not in_front:
         return {}
-    layout = unknowns_in_state(problem, state)
     kept = estimated(layout)
     whole = information_of_images(sums, problem, state, layout).sum(axis=0)
     information = whole[np.ix_(kept, kept)] + np.diag(layout.prior_precision[kept])
