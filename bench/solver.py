@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from bench import competitors
 from bench.table import Table, verdict
 from bench.trials import memory_mb
-from starcal_ros.estimation.star_equations import normal_blocks, RESIDUAL, ROTATION
+from starcal_ros.estimation.star_equations import normal_blocks, ROTATION
 from starcal_ros.records import Ensemble
 from studies.workers import run_each
 
@@ -46,7 +46,7 @@ def cost_of(case: competitors.Case, answer: competitors.Answer, steps: int = 0) 
     held = (case.measurements, 'plumb_bob', answer.parameters)
     for _ in range(steps):
         _, blocks = normal_blocks(*held, rotations.as_matrix())
-        gradient = blocks[:, ROTATION, RESIDUAL, None]
+        gradient = blocks[:, ROTATION, -1, None]
         step = np.linalg.solve(blocks[:, ROTATION, ROTATION], gradient)[..., 0]
         rotations = Rotation.from_rotvec(-step) * rotations
     return normal_blocks(*held, rotations.as_matrix())[0]

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.lookup import GRID, grid_lines_of_sight, line_of_sight_table
-from starcal_ros.camera import pixel_grid
+from starcal_ros.assessment.lookup import GRID, grid_lines_of_sight, line_of_sight_table, movement
+from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.record_fields import json_object
@@ -305,3 +305,16 @@ def content(comparison: Comparison) -> dict[str, object]:
         'notes': comparison.notes,
     }
     return json_object(values)
+
+
+def map_error_px(found: CameraModel, true: CameraModel) -> float:
+    """
+    RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
+
+    The best common rotation is removed, because a calibration assigns it to the alignment.
+    Infinite if a pixel has no line of sight, where the distortion folds.
+    """
+    unturned = np.array([0.0, 0.0, 0.0, 1.0])
+    before, after = CameraGeometry(found, unturned), CameraGeometry(true, unturned)
+    _, left_px = movement(before, after, GRID, GRID)
+    return float(np.sqrt(np.mean(left_px**2)))

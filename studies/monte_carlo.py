@@ -21,9 +21,8 @@ import zlib
 import numpy as np
 from scipy.stats import chi2
 
-from starcal_ground.comparison import parameter_difference
+from starcal_ground.comparison import map_error_px, parameter_difference
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.records import ALIGNMENT_NAMES

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
+from starcal_ground.comparison import map_error_px
 from starcal_ground.report import svg
 from starcal_ground.report.detector_figures import detector_map, distortion_vectors, star_cloud
 from starcal_ground.report.figures import outline
@@ -27,7 +28,6 @@ from starcal_ground.report.svg import Curve, Drawing, Panel, plot, SERIES, sheet
 from starcal_ground.simulation.rendering import fixed_pattern, render
 from starcal_ground.simulation.scenario import attitude_samples, Scenario, scenario, scene
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid, project
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.problem import METHODS

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtrc
 
+from starcal_ground.comparison import map_error_px
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.estimation.calibrate import Estimate, residuals_px
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.problem import Problem, State

@@ -42,7 +42,7 @@ _SIGMAS, _STILL_PX = 5.0, 0.02
 
 
 @dataclass(frozen=True)
-class Exposure:
+class Fingerprint:
     """Stamp, stars (n, 2) from bright to faint, and noise, a unit vector or zeros, of an image."""
 
     time_ns: int
@@ -73,7 +73,7 @@ def equal_to(before_ns: int) -> str:
     return f'its pixels are those of the image of {utc_text(before_ns)}'
 
 
-def encoded_again(exposures: Sequence[Exposure]) -> dict[int, str]:
+def encoded_again(exposures: Sequence[Fingerprint]) -> dict[int, str]:
     """Words on each image that is an earlier one encoded again, by its stamp."""
     noise = np.array([one.noise for one in exposures])
     common = np.asarray(noise @ noise.T, np.float64)
@@ -111,7 +111,7 @@ def _without_pattern(
     return part, max(_LEAST_COMMON, 1.0 / (len(others) + 1) + _BY_CHANCE)
 
 
-def _are_still(one: Exposure, other: Exposure) -> bool:
+def _are_still(one: Fingerprint, other: Fingerprint) -> bool:
     """True unless the brightest stars of an image are at other places in another."""
     stars = one.stars_px[:_BRIGHTEST]
     if min(len(stars), len(other.stars_px)) < _FEWEST_STARS:

@@ -112,7 +112,7 @@ class FromStars:
 
 
 @dataclass(frozen=True)
-class _Sources:
+class _RankedSources:
     """
     Sources of an image by their light: all, and the compact ones, without glare.
 
@@ -190,12 +190,12 @@ def from_stars(
 
 def _sources(
     images: Iterable[Image],
-) -> tuple[list[_Sources], tuple[int, int], dict[int, str]]:
+) -> tuple[list[_RankedSources], tuple[int, int], dict[int, str]]:
     """Sources of the images that differ, their size, and words on each copy by its stamp."""
-    seen: list[_Sources] = []
+    seen: list[_RankedSources] = []
     size = (0, 0)
     first_ns: dict[str, int] = {}
-    exposures: list[copies.Exposure] = []
+    exposures: list[copies.Fingerprint] = []
     found: dict[int, str] = {}
     for image in images:
         height, width = image.pixels.shape
@@ -214,9 +214,9 @@ def _sources(
         sources = bright_sources(image.pixels)
         is_star = sources.wide_px > _HOT_PIXEL_PX
         noise = copies.noise_of(image.pixels)
-        exposures.append(copies.Exposure(image.time_ns, sources.xy_px[is_star], noise))
+        exposures.append(copies.Fingerprint(image.time_ns, sources.xy_px[is_star], noise))
         stars = count_of_stars(image.pixels, sources)
-        seen.append(_Sources(image.time_ns, sources.rankings, stars))
+        seen.append(_RankedSources(image.time_ns, sources.rankings, stars))
     found |= copies.encoded_again(exposures)
     return [one for one in seen if one.time_ns not in found], size, found
 
@@ -273,7 +273,7 @@ def _usual(size: tuple[int, int], half_px: float, model: str, half_rad: float) -
 
 
 def _first_match(
-    seen: Sequence[_Sources],
+    seen: Sequence[_RankedSources],
     cameras: Sequence[CameraModel],
     catalog: StarCatalog,
     most: float = _MOST_EFFORT,
@@ -319,7 +319,7 @@ def _of_better_lens(sky: SkyMatch, xy_px: Floats, catalog: StarCatalog) -> SkyMa
 
 
 def _all_matches(
-    seen: Sequence[_Sources], finder: ImageSearch, rotation: Rotation
+    seen: Sequence[_RankedSources], finder: ImageSearch, rotation: Rotation
 ) -> dict[int, SkyMatch]:
     """The images that the camera of the first match, of this rotation, identifies, by stamp."""
     matches: dict[int, SkyMatch] = {}

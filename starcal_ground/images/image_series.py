@@ -105,7 +105,7 @@ class ImageFile:
 
 
 @dataclass(frozen=True)
-class Scale:
+class PixelScale:
     """Mapping of pixel values to 16 bit, ``dn = round((value - offset) / step)``; or none."""
 
     offset: float
@@ -159,14 +159,14 @@ def look(path: Path, options: ImageOptions) -> ImageFile:
     )
 
 
-def pixels_of(path: Path, options: ImageOptions, scale: Scale) -> Pixels:
+def pixels_of(path: Path, options: ImageOptions, scale: PixelScale) -> Pixels:
     """Pixels (height, width) of an image file, in 8 or 16 bit."""
     pixels = scale.to_dn(_of_options(path, options).values)
     pixels.setflags(write=False)
     return pixels
 
 
-def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
+def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> PixelScale:
     """The scale of all images; none if whole numbers fit 16 bit.  Raises IngestError."""
     kinds = [file.dtype for file in files] if options.value_range is None else []
     low, high = options.value_range or (
@@ -179,15 +179,15 @@ def common_scale(files: Sequence[ImageFile], options: ImageOptions) -> Scale:
     return scale
 
 
-def scale_of(kinds: Sequence[np.dtype[Any]], low: float, high: float) -> Scale:
+def scale_of(kinds: Sequence[np.dtype[Any]], low: float, high: float) -> PixelScale:
     """The scale of values of some types from ``low`` to ``high``; without a type to 16 bit."""
     if kinds and all(kind.kind in 'ui' for kind in kinds):
         if low >= 0 and high <= 65535:
             eight = all(kind.itemsize == 1 for kind in kinds)
-            return Scale(0.0, 1.0, np.uint8 if eight else np.uint16)
+            return PixelScale(0.0, 1.0, np.uint8 if eight else np.uint16)
         if high - low <= _FULL:
-            return Scale(low, 1.0, np.uint16)
-    return Scale(low, (high - low) / _FULL, np.uint16)
+            return PixelScale(low, 1.0, np.uint16)
+    return PixelScale(low, (high - low) / _FULL, np.uint16)
 
 
 def check_alike(files: Sequence[ImageFile]) -> None:

@@ -316,7 +316,7 @@ class Cone:
 
 
 @dataclasses.dataclass(frozen=True)
-class Request:
+class PlanRequest:
     """
     Wishes and bounds of a plan.
 
@@ -369,7 +369,7 @@ class Plan:
 
 
 @one_blas_thread()
-def plan_pointings(ensemble: Ensemble, setup: Setup, request: Request) -> Plan:
+def plan_pointings(ensemble: Ensemble, setup: Setup, request: PlanRequest) -> Plan:
     """
     Return the pointings that lower a sigma most, each given those before it.
 
@@ -395,7 +395,7 @@ def plan_pointings(ensemble: Ensemble, setup: Setup, request: Request) -> Plan:
 
 
 def _chosen(
-    each: Prospect, wanted: Target, request: Request, pointings: Sequence[Pointing], free: Mask
+    each: Prospect, wanted: Target, request: PlanRequest, pointings: Sequence[Pointing], free: Mask
 ) -> list[int]:
     """Return the numbers of the pointings to take; ``free`` (c,) show stars."""
     boresights = np.array([_direction(one.ra_deg, one.dec_deg) for one in pointings])
@@ -410,7 +410,7 @@ def _chosen(
     return chosen
 
 
-def _allowed(request: Request) -> list[Pointing]:
+def _allowed(request: PlanRequest) -> list[Pointing]:
     """Return the allowed pointings: of the list, or evenly over the cone, each with a roll."""
     allowed = list(request.pointings) or _over(request.within)
     boresights = np.array([_direction(one.ra_deg, one.dec_deg) for one in allowed])
@@ -503,7 +503,7 @@ def _planned(campaign: Campaign, minimise: str, check: GateCheck) -> GateCheck:
     if not check.found > check.limit:
         return check
     try:
-        request = Request(_MOST_IMAGES, minimise)
+        request = PlanRequest(_MOST_IMAGES, minimise)
         plan = plan_pointings(campaign.ensemble, campaign.setup, request)
     except (StarcalError, np.linalg.LinAlgError):  # not estimated, or no image shows a star
         return check

@@ -175,7 +175,7 @@ def _px(value: float) -> str:
 
 
 @dataclass(frozen=True)
-class Row:
+class ParameterRow:
     """Row of the parameter table; numbers as text, empty if absent."""
 
     name: str
@@ -189,7 +189,7 @@ class Row:
 
 def parameter_rows(
     calibration: records.Calibration, prior: records.CameraGeometry | None
-) -> list[Row]:
+) -> list[ParameterRow]:
     """Value, sigma and change of each camera parameter."""
     camera, sigma = calibration.geometry.camera, calibration.sigma[:-3]
     if prior and not prior.camera.has_lens(camera.model):
@@ -200,7 +200,7 @@ def parameter_rows(
         known, changed = sigma[k] > 0, prior and changes[k]
         held = '' if name in calibration.estimated else 'held, ' if known else 'held'
         rows.append(
-            Row(
+            ParameterRow(
                 name=name,
                 unit=_UNITS.get(name, ''),
                 value=to_sigma(camera.parameters[k], sigma[k]),
@@ -215,7 +215,7 @@ def parameter_rows(
 
 def alignment_rows(
     calibration: records.Calibration, prior: records.CameraGeometry | None
-) -> list[Row]:
+) -> list[ParameterRow]:
     """
     Change and sigma of the alignment about each axis, arcsec; none of the camera alone.
 
@@ -232,7 +232,7 @@ def alignment_rows(
         else np.zeros(3)
     )
     return [
-        Row(
+        ParameterRow(
             name=axis,
             unit='arcsec',
             sigma=f'{sigma[k]:.2f}',

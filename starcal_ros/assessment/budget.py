@@ -98,12 +98,16 @@ def _part(cause: str, variance_rad2: Floats, assumption: str) -> SigmaPart:
 
 
 def statements(
-    parts: Sequence[SigmaPart], estimate: Estimate, options: CalibrationOptions
+    parts: Sequence[SigmaPart],
+    estimate: Estimate,
+    options: CalibrationOptions,
+    has_dates: bool = True,
 ) -> tuple[Statement, ...]:
     """
     Return what to state to lower the sigma of a budget, the largest fall first.
 
     The variance of a cause that the stars do not show is in proportion to that of its prior.
+    ``has_dates`` is False where the images state no date: some statements need it.
     """
     total = next(part for part in parts if part.cause == TOTAL)
     has_alignment = any(part.cause in _causes_of_trackers() for part in parts)
@@ -112,7 +116,7 @@ def statements(
     for part in parts:
         if not max(part.map_arcsec, part.pointing_arcsec) > 0:
             continue
-        option, value, left = _to_state(part.cause, estimate, options)
+        option, value, left = _to_state(part.cause, estimate, options, has_dates)
         for scope, of in scopes if option else ():
             before, gone = getattr(total, of), getattr(part, of)
             after = math.sqrt(max(before**2 - (1.0 - left) * gone**2, 0.0))
@@ -139,7 +143,9 @@ def _names_by_cause(layout: Layout) -> dict[str, list[str]]:
     return found
 
 
-def _to_state(cause: str, estimate: Estimate, options: CalibrationOptions) -> Option:
+def _to_state(
+    cause: str, estimate: Estimate, options: CalibrationOptions, has_dates: bool
+) -> Option:
     """Return an option that is not stated, with a plausible value, or `NO_OPTION`."""
     if cause == TRACKER_SLOW and not options.star_tracker_slow_arcsec:
         noise = options.star_tracker_sigma_arcsec
@@ -150,9 +156,14 @@ def _to_state(cause: str, estimate: Estimate, options: CalibrationOptions) -> Op
         slow = 0.5 * min(noise)
         return 'star_tracker_slow_arcsec', significant(slow, 2), (slow / _slow(estimate)) ** 2
     layout = estimate.linear.layout
-    names = _names_by_cause(layout).get(cause, [])
-    given = (layout[name].kind.option(layout, options) for name in names)
-    return next((option for option in given if option is not NO_OPTION), NO_OPTION)
+    for name in _names_by_cause(layout).get(cause, []):
+        kind = layout[name].kind
+        option, value, left = kind.option(layout, options)
+        if option and kind.needs_dates and not has_dates:
+            option = f'{option} (and dates: the images have none)'
+        if option:
+            return option, value, left
+    return NO_OPTION
 
 
 @dataclass(frozen=True)
@@ -298,7 +309,7 @@ def _estimated(rms_px: float, likelihood_ratio: float) -> str:
 
 
 def _field_px(estimate: Estimate) -> float:
-    """Return the RMS of the field over the detector, what is not known of it included."""
+    """Return the RMS of the field over the detector, its uncertainty included."""
     place = estimate.linear.layout.field_at
     square = estimate.posterior.mean[place] ** 2 + np.diag(estimate.posterior.covariance)[place]
     return math.sqrt(0.5 * float(square.sum()))

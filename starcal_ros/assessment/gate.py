@@ -277,13 +277,12 @@ def _changes(
 
     An alignment follows the principal point, which a prior has within a part of the image.
     """
-    before, name, factors, centre_deg = prior, 'the prior', (_PRIOR_FACTOR, _PRIOR_ROTATION), 0.0
+    before, name, factors, centre_deg = prior, 'the active calibration', (1.0, 1.0), 0.0
     if active is not None:
-        before, name, factors = active.geometry, 'the active calibration', (1.0, 1.0)
-        if calibration.temperature is not None:
-            before = camera_at(active, calibration.temperature.reference_degc)
+        thermal = calibration.temperature
+        before = camera_at(active, thermal.reference_degc) if thermal else active.geometry
     else:
-        camera = prior.camera
+        name, camera = 'the prior', prior.camera
         half_px = 0.5 * math.hypot(camera.width, camera.height)
         factors = max(_PRIOR_FACTOR, _PRIOR_FACTOR_PER_PX * half_px), _PRIOR_ROTATION
         centre_px = estimation.principal_point_prior * max(camera.width, camera.height)

@@ -150,7 +150,7 @@ def common_rotation(camera: CameraModel, grid: Derivatives | None = None) -> Flo
     """
     Least-squares rotation (3, k) common to a grid of pixels, by the k numbers of `Derivatives`.
 
-    Zero for the alignment.  ``grid``: the `grid_derivatives`, where they are at hand.
+    It is zero for the alignment.  ``grid`` has the `grid_derivatives` where they are at hand.
     """
     p, grid = len(camera.parameters), grid or grid_derivatives(camera)
     seen = np.isfinite(grid.directions[:, 0])

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from starcal_ros.arrays import Floats
+from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
@@ -24,9 +25,8 @@ from starcal_ros.estimation.shared_errors import coarsest_cell_px
 from starcal_ros.estimation.unknowns import CHANGE
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
-_CLEAR_SIGMA = 5.0  # the default of the gate: a conflict that fails must be in the evidence too
 _STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
-_MARGIN = 0.1  # of the sides, where lenses leave residuals that look like steps: WISPR 0.25 px
+_MARGIN = 0.1  # ends of a side, as a share of it: lenses leave 0.25 px there that look like steps
 
 
 def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()) -> ModelChecks:
@@ -101,10 +101,11 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
 
     Each prior is tested by estimating again without it, a held parameter by estimating it: the
     field and the shapes of the images absorb the conflict, the unknown itself hardly moves.  Free
-    unknowns also fit errors of the lens: more than `_CLEAR_SIGMA` counts where the data are as
-    much likelier without the prior, and otherwise as much as they are.  What the stars alone do
+    unknowns also fit errors of the lens: a distance that fails the gate counts where the data are
+    as much likelier without the prior, and otherwise as much as they are.  What the stars alone do
     not determine is listed too, with NaN.
     """
+    clear_sigma = GateOptions.max_held_term_sigma
     found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
     terms = []
     camera = np.arange(layout.count)[layout.places['camera']]
@@ -137,8 +138,8 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
             # Errors that observations share are in both variances.
             prior2 = min(1.0 / layout.prior_precision[k], entry.plausible_sigma**2)
             sigma = math.sqrt(prior2 + shown * total[k] / working[k])
-            is_far = math.isinf(entry.plausible_sigma) and abs(off) > _CLEAR_SIGMA * sigma
-            evidence = gained if is_far and not gained > 0.5 * _CLEAR_SIGMA**2 else math.nan
+            is_far = math.isinf(entry.plausible_sigma) and abs(off) > clear_sigma * sigma
+            evidence = gained if is_far and not gained > 0.5 * clear_sigma**2 else math.nan
             # What is not in the state is zero there, so far from its prior mean.
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
             if k in camera:

@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import (
     common_rotation,
-    GRID,
     grid_derivatives,
     line_of_sight_table,
-    movement,
     sigma_arcsec,
 )
 from starcal_ros.camera import CameraModel, parameter_names, pixel_grid
@@ -28,7 +26,7 @@ from starcal_ros.estimation.problem import Problem, State, supported_terms
 from starcal_ros.estimation.search import estimated, problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import correlations_of, expected_slow_of_mean
-from starcal_ros.estimation.unknowns import unknowns_in_state
+from starcal_ros.estimation.unknowns import Layout, unknowns_in_state
 from starcal_ros.records import (
     ALIGNMENT_NAMES,
     CameraGeometry,
@@ -74,8 +72,7 @@ def image_information(
     order, with_rate, _ = supported_terms(
         ensemble, options.focal_temperature_order, options.alignment_temperature
     )
-    problem, state, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
-    layout = unknowns_in_state(problem, state)
+    problem, state, layout, sums, _ = _at_the_prior(ensemble, prior, options, order, with_rate)
     kept = estimated(layout)
     information = information_of_images(sums, problem, state, layout)
     seen = np.asarray(sums.blocks.any(axis=(1, 2)))
@@ -123,8 +120,12 @@ def _at_the_prior(
     options: CalibrationOptions,
     order: int,
     with_rate: bool,
-) -> tuple[Problem, State, StarSums, bool]:
-    """Problem, initial state, sums over the stars, and True if all stars are before the camera."""
+) -> tuple[Problem, State, Layout, StarSums, bool]:
+    """
+    Return the initial state of a problem, its unknowns and the sums over its stars.
+
+    The last value is True if all stars are in front of the camera.
+    """
     problem = problem_of(ensemble, prior, options)
     state = start_of(problem, prior, order, with_rate)
     table = star_table(ensemble.images)
@@ -132,7 +133,7 @@ def _at_the_prior(
     measurements = arrange(table, enough[table.image], table.covariance_px2)
     layout = unknowns_in_state(problem, state)
     cost, sums = stars_alone(problem, state, layout, measurements)
-    return problem, state, sums, math.isfinite(cost)
+    return problem, state, layout, sums, math.isfinite(cost)
 
 
 def _sigma_with(
@@ -143,10 +144,11 @@ def _sigma_with(
     with_rate: bool,
 ) -> dict[str, float]:
     """1-sigma by name; empty if not observable."""
-    problem, state, sums, in_front = _at_the_prior(ensemble, prior, options, order, with_rate)
+    problem, state, layout, sums, in_front = _at_the_prior(
+        ensemble, prior, options, order, with_rate
+    )
     if not in_front:
         return {}
-    layout = unknowns_in_state(problem, state)
     kept = estimated(layout)
     whole = information_of_images(sums, problem, state, layout).sum(axis=0)
     information = whole[np.ix_(kept, kept)] + np.diag(layout.prior_precision[kept])
@@ -250,19 +252,6 @@ def map_sigma_px(camera: CameraModel, covariance: MapCovariance) -> Floats:
     J = grid.of_shape(camera, common_rotation(camera, grid))
     shape_sigma_arcsec = sigma_arcsec(grid.covariance_rad2(covariance, J))
     return np.asarray(shape_sigma_arcsec * ARCSECOND_RAD * camera.parameters[0])
-
-
-def map_error_px(found: CameraModel, true: CameraModel) -> float:
-    """
-    RMS difference over the detector of the lines of sight of two cameras, px at the focal length.
-
-    The best common rotation is removed, because a calibration assigns it to the alignment.
-    Infinite if a pixel has no line of sight, where the distortion folds.
-    """
-    unturned = np.array([0.0, 0.0, 0.0, 1.0])
-    before, after = CameraGeometry(found, unturned), CameraGeometry(true, unturned)
-    _, left_px = movement(before, after, GRID, GRID)
-    return float(np.sqrt(np.mean(left_px**2)))
 
 
 def detector_maps(camera: CameraModel, covariance: MapCovariance, pixels: Floats) -> DetectorMaps:

@@ -10,10 +10,10 @@ variance, become ``G r + G J (N - M_k)^-1 J' G r`` and have the covariance ``G +
 ((N - M_k)^-1 + E) J' G``, where V is the variance of an observation over the working one and E the
 covariance of the others by the errors that observations share, beyond the working weights.  (The
 posterior averaged over the amplitudes has wide tails: less an image, its inverse is nearly
-singular.)  Stars, cells and stars alike are predicted as groups: the sum of
-the residuals of a group has the variance of their noise and of the error that they share, less
-the part that the unknowns absorb.  The mean square over the predicted variance is 1 where the
-model and its sigmas hold, in every part of the data.
+singular.)  Stars, cells and stars of like brightness are predicted as groups: the sum of the
+residuals of a group has the variance of their noise and of the error that they share, less the
+part that the unknowns absorb.  The mean square over the predicted variance is 1 where the model
+and its sigmas hold, in every part of the data.
 """
 
 from __future__ import annotations
@@ -159,10 +159,10 @@ def _radius_px(estimate: Estimate, pixels: Floats) -> Floats:
 
 def predicted_residuals(estimate: Estimate) -> tuple[Floats, Floats]:
     """
-    Return squared whitened residuals (n,) of stars, their image predicted by the others.
+    Return squared whitened residuals (n,) of stars, and their expected values (n,).
 
-    With their expected values (n,); NaN for stars that were not used, and of images without which
-    the others determine no calibration.
+    The image of a star is predicted by the others.  NaN for stars that were not used, and for
+    stars of images without which the others determine no calibration.
     """
     found: Floats = np.full(len(estimate.table), np.nan)
     expected: Floats = np.full(len(estimate.table), np.nan)

@@ -113,7 +113,7 @@ def _stated_velocities(
     """
     Return stamps and velocities (k, 3) in the directions of some images that state one.
 
-    None of images on the ground, of another catalog or with fewer than two stars.
+    Images on the ground, of another catalog or with fewer than two stars are left out.
     """
     usable = [
         image

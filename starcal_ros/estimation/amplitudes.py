@@ -23,19 +23,21 @@ import functools
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import brentq
 from scipy.special import erf, expit
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.limits import LEAST_GAIN, MOST_CORRELATED, MOST_ROUNDS, ROUNDING
+from starcal_ros.estimation.limits import (
+    LEAST_GAIN,
+    MOST_CORRELATED,
+    MOST_ROUNDS,
+    ROUNDING,
+    ROWS_AT_ONCE,
+)
 
-# Prior of the logarithm of an amplitude: a lens or a detector departs from its model by a
-# micropixel as likely as by a tenth of a pixel.  A narrower prior, or one that is centred where
-# departures matter, costs a sound camera up to 30 % of its sigma.
-LOG_CENTRE, LOG_SIGMA = math.log(1e-5), 4.0
-UNSTATED = LOG_CENTRE, LOG_SIGMA
 # An octave of the field is smaller than the one before, within a factor of e.
 OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
@@ -48,6 +50,24 @@ STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
 # Common factors of the amplitudes over which results are averaged, in logarithms: from one without
 # an effect to one that few images still allow.  Many images leave the factor 1 alone.
 _SHIFTS: Floats = np.asarray(np.linspace(-8.0, 6.0, 43), np.float64)
+
+
+@dataclass(frozen=True)
+class LogPrior:
+    """
+    Normal prior of the logarithm of an amplitude: its centre and its 1-sigma.
+
+    The default is the prior of an amplitude in px that nothing states: a lens or a detector
+    departs from its model by a micropixel as likely as by a tenth of a pixel.  A narrower prior,
+    or one that is centred where departures matter, costs a sound camera up to 30 % of its sigma.
+    """
+
+    centre: float = math.log(1e-5)
+    sigma: float = 4.0
+
+    def log_density(self, log_amplitude: NDArray[np.floating]) -> Floats:
+        """Return the log density (...) at logarithms (...), up to a constant."""
+        return np.asarray(-0.5 * ((log_amplitude - self.centre) / self.sigma) ** 2)
 
 
 def log_amplitudes(largest_px: float) -> Floats:
@@ -90,15 +110,11 @@ class Averaged:
     log_evidence: float
 
 
-def octave_prior(count: int, first: tuple[float, float] = UNSTATED) -> tuple[Floats, Floats]:
-    """
-    Mean (count,) and precision (count, count) of the logarithms of octaves in a chain.
-
-    ``first``: mean and 1-sigma of that of the first.
-    """
-    mean: Floats = first[0] + OCTAVE_STEP * np.arange(count, dtype=np.float64)
+def octave_prior(count: int, first: LogPrior = LogPrior()) -> tuple[Floats, Floats]:
+    """Mean (count,) and precision (count, count) of the logarithms of octaves in a chain."""
+    mean: Floats = first.centre + OCTAVE_STEP * np.arange(count, dtype=np.float64)
     precision = np.zeros((count, count))
-    precision[0, 0] = first[1] ** -2
+    precision[0, 0] = first.sigma**-2
     for k in range(1, count):
         precision[k - 1 : k + 1, k - 1 : k + 1] += np.array([[1, -1], [-1, 1]]) / OCTAVE_SIGMA**2
     return mean, precision
@@ -109,7 +125,7 @@ def field_amplitudes(
     gradient: Floats,
     octave: Indices,
     near: Amplitudes | None = None,
-    first: tuple[float, float] = UNSTATED,
+    first: LogPrior = LogPrior(),
 ) -> Amplitudes:
     """
     Amplitudes of the octaves of a field by Fisher scoring.
@@ -121,8 +137,8 @@ def field_amplitudes(
     octave : (q,)
     near : Amplitudes, optional
         Amplitudes of the round before: the search starts there and from one other place.
-    first : float, float
-        Prior of the first octave, as of `octave_prior`.
+    first : LogPrior
+        Prior of the first octave.
     """
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count, first)
@@ -192,7 +208,7 @@ def averaged_field(
     octave: Indices,
     amplitudes: Amplitudes,
     term: Floats,
-    first: tuple[float, float] = UNSTATED,
+    first: LogPrior = LogPrior(),
 ) -> Averaged:
     """
     Return the coefficients averaged over a common factor of the amplitudes of the octaves.
@@ -223,7 +239,7 @@ def averaged_field(
     prior = np.exp(2.0 * log_term)
     of_term = prior / (1.0 + prior * own)
     log_share = 0.5 * (of_term * pull**2 - np.log1p(prior * own))
-    log_share -= 0.5 * ((log_term - LOG_CENTRE) / LOG_SIGMA) ** 2
+    log_share += LogPrior().log_density(log_term)
     share = np.exp(log_share - log_share.max(axis=1, keepdims=True))
     share /= share.sum(axis=1, keepdims=True)
     weight = np.exp(log_weight - log_weight.max())
@@ -274,11 +290,10 @@ class ShapeSums:
     time_s: Floats = field(default_factory=lambda: np.empty(0))
 
 
-# Correlation of the shapes of images a step apart: heat decays so in ten images, or in a quarter
-# of an orbit about the Earth if that is shorter.
+# Correlation of the shapes of images one step apart: a lens warms or cools within ten images, or
+# within a quarter of an orbit about the Earth if that is shorter.
 _PER_STEP = 0.9
 _STEP_S = 100.0  # time in which heat loses a tenth
-_AT_ONCE = 8192  # images times trials: with more, memory is slower
 
 
 @dataclass(frozen=True)
@@ -306,10 +321,10 @@ def shapes(sums: ShapeSums, near: Amplitudes | None = None) -> Shapes:
     """Return the amplitudes of the shapes; ``near``: those of the round before."""
     likelihood = _shape_likelihood(sums)
     m, count = sums.gradient.shape
-    best, value = _climb(likelihood, count, _AT_ONCE // max(m, 1), near)
+    best, value = _climb(likelihood, count, ROWS_AT_ONCE // max(m, 1), near)
     none = np.full(len(best), math.log(LEAST_PX))
-    prior = ((best - LOG_CENTRE) ** 2 - (none - LOG_CENTRE) ** 2).sum() / LOG_SIGMA**2
-    ratio = 2.0 * (value - float(likelihood(none[None])[0])) + float(prior)
+    by_prior = (LogPrior().log_density(best) - LogPrior().log_density(none)).sum()
+    ratio = 2.0 * (value - float(likelihood(none[None])[0])) - 2.0 * float(by_prior)
     shift = _SHIFTS[math.log(LARGEST_SHAPE_PX) - best.max() >= _SHIFTS]
     log_weight = likelihood(best + shift[:, None])
     if not np.isfinite(log_weight.max()):
@@ -348,7 +363,7 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
     def likelihood(log_px: Floats) -> Floats:
         k, s = len(log_px), np.exp(log_px)
         shown = np.flatnonzero(s**2 @ total > LEAST_GAIN)
-        if k > 1 and len(shown) * m > _AT_ONCE:  # more at once is slower: memory
+        if k > 1 and len(shown) * m > ROWS_AT_ONCE:
             return np.concatenate([likelihood(log_px[: k // 2]), likelihood(log_px[k // 2 :])])
         left, log_det = np.tile(whole, (k, 1, 1)), np.zeros(k)
         size2 = (s[shown, :, None] * s[shown, None, :])[:, None]
@@ -363,8 +378,8 @@ def _shape_likelihood(sums: ShapeSums) -> Callable[[Floats], Floats]:
             return np.concatenate([likelihood(one[None]) for one in log_px])
         shared = np.linalg.solve(lower, left[:, :P, P:])[..., 0]
         log_det += 2.0 * np.log(np.einsum('kii->ki', lower)).sum(axis=1)
-        prior = ((log_px - LOG_CENTRE) ** 2).sum(axis=1) / LOG_SIGMA**2
-        return np.asarray(0.5 * ((shared**2).sum(axis=1) - left[:, P, P] - log_det - prior))
+        prior = LogPrior().log_density(log_px).sum(axis=1)
+        return np.asarray(0.5 * ((shared**2).sum(axis=1) - left[:, P, P] - log_det) + prior)
 
     return likelihood
 
@@ -486,5 +501,5 @@ def _evidence(values: Floats, ones: Floats, along: Floats) -> float:
     of_ones, mean = inverse @ ones**2, inverse @ (ones * along)
     squared = inverse @ along**2 - mean**2 / of_ones
     log_det = np.log(of_ones) - np.log(inverse).sum(axis=1)
-    prior = ((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2
-    return float(np.logaddexp.reduce(-0.5 * (log_det + squared + prior)))
+    prior = LogPrior().log_density(log_px)
+    return float(np.logaddexp.reduce(prior - 0.5 * (log_det + squared)))

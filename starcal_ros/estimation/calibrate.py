@@ -22,8 +22,9 @@ from starcal_ros.camera import project_parameters
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
-from starcal_ros.estimation.amplitudes import STARTS_PX, UNSTATED
+from starcal_ros.estimation.amplitudes import LogPrior, STARTS_PX
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
+from starcal_ros.estimation.image_rotations import sky_rotations, turned
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS
 from starcal_ros.estimation.options import (
@@ -58,10 +59,9 @@ from starcal_ros.estimation.star_equations import (
     squared_sigmas,
     star_table,
     StarTable,
-    turned,
 )
 from starcal_ros.estimation.tracker_errors import (
-    Attitudes,
+    AttitudeErrors,
     measured_rates,
     star_tracker_alignments,
 )
@@ -79,7 +79,6 @@ from starcal_ros.estimation.weights import (
     Data,
     degrees_of_freedom,
     judge,
-    sky_rotations,
     tracker_attitudes,
     weighted_attitudes,
     Weighting,
@@ -96,7 +95,7 @@ _START_FLOOR_PX = 0.05  # good images leave about that much; the residuals repla
 _ROBUST_SCALE = 3.0  # Cauchy loss, sigma: normal noise loses 3 % of its information
 _ROBUST_GAIN = 0.1  # steps of less than half a sigma are left to the posterior
 _LEAST_SHARE = 0.25  # smaller steps would not arrive within `MOST_ROUNDS`
-_SPACE_VELOCITY_M_S = 20000.0  # against the Earth: orbits about both Earth and Sun have such
+_SPACE_VELOCITY_M_S = 20000.0  # against the Earth, usual in orbits about the Earth and the Sun
 _PLAUSIBLE_M_S = 8000.0  # orbits about the Earth are no faster
 _UNKNOWN_READOUT_S = 0.02  # a rolling shutter takes 5 to 50 ms a frame
 _LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states it on the ground; flight changes it
@@ -145,7 +144,7 @@ class Estimate:
         Stars that misfit across images and were left out of all.
     alignment_scatter_arcsec : float
         RMS per axis of the alignments that the images show, about their mean.
-    attitudes : Attitudes
+    attitudes : AttitudeErrors
     iterations, termination
     thermal : TemperatureTerms or None
         None where no change with temperature was asked for.
@@ -174,7 +173,7 @@ class Estimate:
     misfit_image: Mask
     dropped_catalog_id: NDArray[np.int64]
     alignment_scatter_arcsec: float
-    attitudes: Attitudes
+    attitudes: AttitudeErrors
     iterations: int
     termination: str
     thermal: TemperatureTerms | None
@@ -292,7 +291,7 @@ class _Round:
     after: State
     residual_px: Floats
     freedom: Floats
-    attitudes: Attitudes
+    attitudes: AttitudeErrors
 
 
 def _round(
@@ -343,9 +342,9 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
         'unknown': (0.0, _UNKNOWN_READOUT_S),
     }
     readout = readout_s[options.shutter]
-    lens, refraction = UNSTATED, None
+    lens, refraction = LogPrior(), None
     if options.lens_residual_px:
-        lens = math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA
+        lens = LogPrior(math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA)
     zenith = np.array([image.zenith_icrf for image in ensemble.images])
     is_known = np.isfinite(zenith).all(axis=1)
     if is_known.any():  # where none is stated, as in older recordings, the air turns no star

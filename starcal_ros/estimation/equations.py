@@ -284,7 +284,11 @@ def star_sums(linear: Linearisation) -> StarSums:
 
 
 def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> NormalEquations:
-    """Return the normal equations without priors, with the cost of the star trackers alone."""
+    """
+    Return the normal equations without priors, with the cost of the star trackers alone.
+
+    The rotation of an image has the prior that its star tracker predicts.
+    """
     at = seen_by_stars(layout)
     blocks, cross = sums.blocks, sums.field_cross
     m, P = len(blocks), layout.count
@@ -302,11 +306,20 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
         A[np.ix_(at, field)] = A[np.ix_(field, at)].T
         a[field] = of_field[:, -1]
         B[:, :, field] = cross[:, :, own].transpose(0, 2, 1)
-    cost = _add_star_tracker(A, a, B, C, c, problem, state, layout)
+    whitened, J = whitened_attitude_errors(problem, state)
+    turning, turns = tracker_turns(layout)
+    information = J.transpose(0, 2, 1) @ J
+    gradient = np.einsum('mji,mj->mi', J, whitened)
+    to_shared = information @ turns
+    A[np.ix_(turning, turning)] += np.tensordot(turns, to_shared, axes=((0, 1), (0, 1)))
+    a[turning] += np.tensordot(turns, gradient, axes=((0, 1), (0, 1)))
+    B[:, IMAGE_ROTATION, turning] -= to_shared
+    C[:, IMAGE_ROTATION, IMAGE_ROTATION] += information
+    c[:, IMAGE_ROTATION] -= gradient
     # A rotation on which nothing pulls stays.
     still = ~C[:, IMAGE_ROTATION, IMAGE_ROTATION].any(axis=(1, 2))
     C[still, IMAGE_ROTATION, IMAGE_ROTATION] += np.eye(3)
-    return NormalEquations(cost, A, a, B, C, c)
+    return NormalEquations(0.5 * float((whitened**2).sum()), A, a, B, C, c)
 
 
 def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats | float) -> Equations:
@@ -407,31 +420,3 @@ def tracker_turns(layout: Layout) -> tuple[Indices, Floats]:
     turning = [entry for entry in layout.shared if entry.tracker is not None]
     by = [entry.tracker for entry in turning if entry.tracker is not None]
     return layout.of([entry.name for entry in turning]), np.concatenate(by, axis=2)
-
-
-def _add_star_tracker(
-    A: Floats,
-    a: Floats,
-    B: Floats,
-    C: Floats,
-    c: Floats,
-    problem: Problem,
-    state: State,
-    layout: Layout,
-) -> float:
-    """
-    Add the prior of the rotations about the attitudes that the star trackers predict.
-
-    Return its cost.
-    """
-    whitened, J = whitened_attitude_errors(problem, state)
-    at, turns = tracker_turns(layout)
-    information = J.transpose(0, 2, 1) @ J
-    gradient = np.einsum('mji,mj->mi', J, whitened)
-    to_shared = information @ turns
-    A[np.ix_(at, at)] += np.tensordot(turns, to_shared, axes=((0, 1), (0, 1)))
-    a[at] += np.tensordot(turns, gradient, axes=((0, 1), (0, 1)))
-    B[:, IMAGE_ROTATION, at] -= to_shared
-    C[:, IMAGE_ROTATION, IMAGE_ROTATION] += information
-    c[:, IMAGE_ROTATION] -= gradient
-    return 0.5 * float((whitened**2).sum())

@@ -13,6 +13,9 @@ FEWEST = 3
 MOST_CORRELATED = 100
 """Images, or groups of them, whose correlations are kept: algebra on all of more would take most
 of the time of an estimate, and correlation times are a third of a campaign or more."""
+ROWS_AT_ONCE = 8192
+"""Rows of an array that are worked on at a time, measured: with fewer, calls into numpy take more
+time, with more, the arrays do not stay in the cache."""
 STEP_SIGMA = 0.05
 """Step in 1-sigma below which a search has ended: a twentieth of a sigma moves no result."""
 LEAST_GAIN = 0.5 * STEP_SIGMA**2

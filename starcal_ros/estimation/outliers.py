@@ -123,7 +123,8 @@ def misfit_images(
     majority is unclear, and none is reported.
     """
     misfit: Mask = np.zeros(len(seen), bool)
-    # Of the variance of normal errors from the median of their squares: relative to the mean.
+    # Efficiency of the variance of normal errors from the median of their squares, against that
+    # from the mean of their squares.
     efficiency = 8.0 * (QUARTILE * math.exp(-0.5 * QUARTILE**2)) ** 2 / (2.0 * math.pi)
     for k in np.unique(star_tracker[seen]):
         here = seen & (star_tracker == k)
@@ -134,9 +135,10 @@ def misfit_images(
         spread2 = np.median(left**2, axis=0) / QUARTILE**2
         # The spread of a dozen images may be small by half: the stated sigma bounds it too.
         usual = np.maximum(np.maximum(spread2, 1.0), variance[here])
-        chance = 0.5 * FALSE_ALARM_RATE / (3 * m)  # of each side of each axis
-        by_scatter = -float(stdtrit(efficiency * (m - 1), chance))
-        limit = _MISFIT_SIGMA if is_stated else by_scatter
+        limit = _MISFIT_SIGMA
+        if not is_stated:
+            chance = 0.5 * FALSE_ALARM_RATE / (3 * m)  # each side of each axis
+            limit = -float(stdtrit(efficiency * (m - 1), chance))
         found = (left**2 > limit**2 * usual).any(axis=1)
         if 3 * np.count_nonzero(found) <= m:
             misfit[here] = found

@@ -25,8 +25,7 @@ from starcal_ros.estimation.amplitudes import (
     averaged_field,
     field_amplitudes,
     LEAST_PX,
-    LOG_CENTRE,
-    LOG_SIGMA,
+    LogPrior,
     Shapes,
     shapes,
     ShapeSums,
@@ -170,7 +169,7 @@ def posterior(
     log_evidence += 0.5 * float((last.own * normal.c).sum())
     log_px = np.log(found.sigma_px)
     log_evidence -= len(normal.c) * float(log_px.sum())
-    log_evidence -= 0.5 * float((((log_px - LOG_CENTRE) / LOG_SIGMA) ** 2).sum())
+    log_evidence += float(LogPrior().log_density(log_px).sum())
     resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
@@ -252,16 +251,17 @@ class _Solver:
         self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
         self.first = field.log_px
 
-    def _of_free(self, arrow: Equations) -> tuple[Floats, Floats]:
-        """Return the covariance of all but the field, the field known, and their gradient."""
-        information = arrow.information[np.ix_(self.free, self.free)]
-        information = information + np.diag(self.precision[self.free])
-        offset = self.precision[self.free] * self.layout.prior_offset[self.free]
-        return inverse(information), arrow.gradient[self.free] - offset
-
     def _of_field(self, arrow: Equations) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-        """Return information and gradient of the field in its unit, and the eliminated part."""
-        free, gradient = self._of_free(arrow)
+        """
+        Return information and gradient of the field in its unit, and the eliminated part.
+
+        That is the covariance of all but the field, the field known, their gradient, and how they
+        follow the field.
+        """
+        of_free = arrow.information[np.ix_(self.free, self.free)]
+        free = inverse(of_free + np.diag(self.precision[self.free]))
+        offset = self.precision[self.free] * self.layout.prior_offset[self.free]
+        gradient = arrow.gradient[self.free] - offset
         cross = arrow.information[np.ix_(self.free, self.field)] * self.unit
         back = free @ cross
         own = arrow.information[np.ix_(self.field, self.field)] * np.outer(self.unit, self.unit)
@@ -463,9 +463,9 @@ def _of_observations(
     found: Posterior, linear: Linearisation, weights: Weights, root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """
-    Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, the images eliminated.
+    Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, and the errors that they share.
 
-    With the whole variance of each error that they share.
+    The images are eliminated.  Each error is the whole variance (r, r) by it.
     """
     rows = weighted_rows_by(linear, root, -found.equations.back @ root)
     whole, own = group_sums(

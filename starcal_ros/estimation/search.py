@@ -4,8 +4,7 @@ The search: its start, and the state of least cost of camera, alignment and imag
 
 An attitude, an alignment or a mounting may be wrong by more than a search can cross: a robust loss
 has no slope far from the stars, and none behind the camera.  Each image therefore begins with the
-rotation from its own stars (Wahba's problem by singular values, Markley 1988); these give
-alignment and mountings.
+rotation from its own stars; these give alignment and mountings.
 """
 
 from __future__ import annotations
@@ -15,25 +14,25 @@ import dataclasses
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from starcal_ros.arrays import Floats, Indices, Mask
-from starcal_ros.camera import CameraModel, line_of_sight
+from starcal_ros.arrays import Floats, Indices
+from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import coefficient_jacobian, LENSES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.equations import arrow, stars_alone
+from starcal_ros.estimation.image_rotations import fitted_rotations
 from starcal_ros.estimation.levenberg_marquardt import (
     levenberg_marquardt,
     NormalEquations,
     Solution,
 )
-from starcal_ros.estimation.limits import FEWEST
 from starcal_ros.estimation.options import (
     assumed_tracker_sigma_rad,
     CalibrationOptions,
     estimated_parameters,
 )
 from starcal_ros.estimation.problem import Problem, reference_degc, star_tracker_names, State
-from starcal_ros.estimation.star_equations import Measurements, StarTable, turned
+from starcal_ros.estimation.star_equations import Measurements, StarTable
 from starcal_ros.estimation.unknowns import Layout, moved, unknowns_in_state
 from starcal_ros.records import CameraGeometry, Ensemble
 
@@ -138,8 +137,8 @@ def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
 
     Lens coefficients by their displacement of a corner: without a prior, those of a numerator and
     a denominator run into a pole on the detector.  The series of a lens is in the angle from its
-    axis: in a narrow field each order is smaller than the one before, and not for its stars to
-    show.
+    axis: in a narrow field each order is smaller than the one before, and the stars do not show
+    it.
     """
     corner = 0.5 * np.array([camera.width, camera.height]) / camera.parameters[0]
     none = np.zeros(len(LENSES[camera.model].coefficients))
@@ -171,7 +170,7 @@ def start_of(problem: Problem, prior: CameraGeometry, order: int, with_rate: boo
 
 def moved_to_stars(problem: Problem, start: State, table: StarTable, camera: CameraModel) -> State:
     """Return a start with alignment, mountings and rotations by the stars, the camera as given."""
-    rotations, by_stars = _rotations(start.camera_from_icrf, table, camera)
+    rotations, by_stars = fitted_rotations(start.camera_from_icrf, table, camera)
     # The alignment to the first star tracker that each image shows, the mountings as assumed.
     shown = rotations * problem.star_tracker_from_icrf.inv()
     if problem.first_from_star_tracker is not None:
@@ -189,29 +188,3 @@ def moved_to_stars(problem: Problem, start: State, table: StarTable, camera: Cam
         camera_from_icrf=rotations,
         mountings=mountings,
     )
-
-
-def _rotations(
-    predicted: Rotation, table: StarTable, camera: CameraModel
-) -> tuple[Rotation, Mask]:
-    """Return the rotations (m,) that fit the stars better, and which are those of the stars."""
-    seen = line_of_sight(camera, table.measured_px)
-    real = np.isfinite(seen).all(axis=1)
-    seen, e, image = seen[real], table.direction_icrf[real], table.image[real]
-    m = table.image_count
-    products = [np.bincount(image, a * b, minlength=m) for a in seen.T for b in e.T]
-    u, _, vt = np.linalg.svd(np.stack(products, axis=1).reshape(m, 3, 3))
-    fitted, before = u @ vt, predicted.as_matrix()
-    # A mirrored image has an improper one: the search finds its negative focal length.
-    good = (np.linalg.det(fitted) > 0) & (np.bincount(image, minlength=m) >= FEWEST)
-    count = np.bincount(image, minlength=m)
-    middle = np.cumsum(count) - count + count // 2
-    # Medians: lengths, at most 2, are sorted within their images by one key.
-    off, off_before = (
-        np.append(np.sort(image + 0.25 * length), np.inf)[middle]
-        for length in (
-            np.linalg.norm(seen - turned(one, image, e), axis=1) for one in (fitted, before)
-        )
-    )
-    good &= off < off_before
-    return Rotation.from_matrix(np.where(good[:, None, None], fitted, before)), good

@@ -35,21 +35,20 @@ from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
     log_amplitudes,
-    LOG_CENTRE,
-    LOG_SIGMA,
+    LogPrior,
     OCTAVE_SIGMA,
     OCTAVE_STEP,
 )
 from starcal_ros.estimation.limits import MOST_ROUNDS, NEGLIGIBLE, ROUNDING
+from starcal_ros.estimation.unknowns import FIELD_OCTAVES
 
-# Wavelengths below those of the field, as fractions of the width: each octave is seen in cells of
-# a sixth of its longest wave, over which it keeps nine tenths of its correlation.
-_FINE_OCTAVES = (1 / 4, 1 / 8, 1 / 16)
+# An octave is seen in cells of a sixth of its longest wave, over which it keeps nine tenths of its
+# correlation.
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
 _TAIL = 2.0  # degrees of freedom of the errors of stars
 _LOG_GRID = log_amplitudes(LARGEST_FIELD_PX)
-_PRIOR: Floats = np.exp(-0.5 * ((_LOG_GRID - LOG_CENTRE) / LOG_SIGMA) ** 2)
+_PRIOR: Floats = np.exp(LogPrior().log_density(_LOG_GRID))
 
 
 @dataclass(frozen=True)
@@ -118,19 +117,25 @@ def observation_groups(pixels: Floats, star: Indices, width: int) -> tuple[Group
     """
     Return the groups of observations at pixels (n, 2) of stars (n,) on a detector of a width, px.
 
-    The stars, and the cells of the fine octaves, from the coarsest of a 24th of the width.
+    The stars, and the cells of the octaves of waves that are too short for the field.
     """
     found = [Groups('star places', star, None, _together(pixels, star, width))]
-    for wave in _FINE_OCTAVES:
-        cells = _cells(pixels, wave / _FINE_OCTAVES[0] * coarsest_cell_px(width))
-        name = f'field at 1/{round(1 / wave)} of the width'
+    for wave_px in _fine_waves_px(width):
+        cells = _cells(pixels, wave_px / _CELLS_PER_WAVE)
+        name = f'field at 1/{round(width / wave_px)} of the width'
         found.append(Groups(name, cells, pairs_of(cells, star)))
     return tuple(found)
 
 
+def _fine_waves_px(width: int) -> list[float]:
+    """Return the longest waves of the octaves below those of the field, as many as it has."""
+    shortest_px = width / 2 ** (FIELD_OCTAVES - 1)
+    return [shortest_px / 2**k for k in range(FIELD_OCTAVES)]
+
+
 def coarsest_cell_px(width: int) -> float:
     """Return the side of the largest cells: over it, no wave of the field changes much."""
-    return _FINE_OCTAVES[0] * width / _CELLS_PER_WAVE
+    return _fine_waves_px(width)[0] / _CELLS_PER_WAVE
 
 
 def _together(pixels: Floats, star: Indices, width: int) -> Floats:
@@ -138,7 +143,7 @@ def _together(pixels: Floats, star: Indices, width: int) -> Floats:
     sightings = np.bincount(star)[star]
     off = [pixel - np.bincount(star, pixel)[star] / sightings for pixel in pixels.T]
     spread_px2 = np.bincount(star, off[0] ** 2 + off[1] ** 2)[star] / sightings
-    usual_px = _FINE_OCTAVES[0] * width / (2.0 * math.pi * math.sqrt(2.0))
+    usual_px = _fine_waves_px(width)[0] / (2.0 * math.pi * math.sqrt(2.0))
     return np.asarray(np.exp(-spread_px2 / usual_px**2))
 
 
@@ -215,10 +220,10 @@ def _of_stars(
     on_sky: Floats, weight: Floats, variance_px2: Floats, star: Indices
 ) -> tuple[float, float, float, Floats]:
     """
-    Return ``c^2``, px^2, and rho of the sightings of stars, and twice their log likelihood ratio.
+    Return ``c^2``, px^2, rho, twice their log likelihood ratio, and the likelihood (g,) of c.
 
-    And the likelihood (g,) of c.  Posterior means: products of pairs of residuals on the sky are
-    fitted by 1 and by the product of their sigmas over that of a usual star.
+    ``c^2`` and rho of the sightings of stars are posterior means: products of pairs of residuals
+    on the sky are fitted by 1 and by the product of their sigmas over that of a usual star.
     """
     usual_px2 = float(np.median(variance_px2[weight > 0]))
     root = weight * np.sqrt(variance_px2 / usual_px2)
@@ -391,9 +396,10 @@ def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
 
 def star_shares_px2(errors: Sequence[SharedError]) -> tuple[Floats | float, Floats | float]:
     """
-    Variance (n,) per axis that sightings of a star share; 0 where it changes no precision.
+    Variance (n,) per axis that sightings of a star share, and the part (n,) of that one star.
 
-    And the part (n,) of it by which a star differs from others of its brightness.
+    That part is the difference from other stars of its brightness.  Both are 0 where they change
+    no precision.
     """
     shares = [(one.share_px2, one.beyond_px2) for one in errors if one.of_star and one.matters]
     return shares[0] if shares else (0.0, 0.0)

@@ -12,13 +12,12 @@ formed.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import ALL_PARAMETER_NAMES
 from starcal_ros.camera.lens import (
     coefficient_jacobian,
     distort,
@@ -26,13 +25,12 @@ from starcal_ros.camera.lens import (
     ideal_by_rotation,
     ideal_points,
 )
+from starcal_ros.estimation.limits import ROWS_AT_ONCE
 from starcal_ros.records import StarObservations
 
-# Rows and columns of the matrix of an image, after those of the camera.
 ROTATION = slice(-4, -1)
-RESIDUAL = -1
-_MOST_TURNS = 64  # unknowns that turn the lines of sight: velocity, site, read-out and others
-_CHUNK_STARS = 8192  # measured: calls into numpy cost more below, the cache more above
+"""Rows and columns of the matrix of an image for its rotation; the last are those of the
+residual."""
 
 
 @dataclass(frozen=True)
@@ -93,8 +91,19 @@ class Measurements:
 
     chunks: tuple[Chunk, ...]
     image_count: int
-    # Reused in every pass: allocating new pages takes as long as the arithmetic on them.
-    derivatives: Floats
+    _room: list[Floats] = field(default_factory=list)
+
+    def derivatives(self, chunk: Chunk, columns: int) -> Floats:
+        """
+        Return an array (2, columns, m n) for a chunk, which the next call overwrites.
+
+        Its memory is kept from pass to pass: new pages take as long as the arithmetic on them.
+        """
+        size = 2 * columns * max(one.measured_px[0].size for one in self.chunks)
+        if not self._room or self._room[0].size < size:
+            self._room[:] = [np.empty(size)]
+        stars = chunk.measured_px[0].size
+        return self._room[0][: 2 * columns * stars].reshape(2, columns, stars)
 
 
 def whitening(covariance_px2: Floats) -> Floats:
@@ -125,7 +134,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
     while first < len(images):
         # Padding is at most half of an image; a single image always fits.
         like = counts[images] <= 1.5 * counts[images[first]] + 8
-        fits = np.arange(1, len(images) - first + 1) * counts[images[first:]] <= _CHUNK_STARS
+        fits = np.arange(1, len(images) - first + 1) * counts[images[first:]] <= ROWS_AT_ONCE
         last = first + max(1, int(np.count_nonzero(like[first:] & fits)))
         chosen = images[first:last]
         width = counts[chosen[-1]]
@@ -145,10 +154,7 @@ def arrange(table: StarTable, keep: NDArray[np.bool_], covariance_px2: Floats) -
             )
         )
         first = last
-    largest = max((chunk.measured_px[0].size for chunk in chunks), default=0)
-    # For the largest lens model and all turns; pages that are not touched cost nothing.
-    columns = len(ALL_PARAMETER_NAMES) + _MOST_TURNS + 5
-    return Measurements(tuple(chunks), table.image_count, np.empty(2 * columns * largest))
+    return Measurements(tuple(chunks), table.image_count)
 
 
 def normal_blocks(
@@ -199,7 +205,7 @@ def normal_blocks(
         product = by_image[:, :, :rows] @ by_image.transpose(0, 1, 3, 2)
         blocks[chunk.image] = (product[0] + product[1])[..., :rows]
     if not np.isfinite(loss_scale):
-        cost = 0.5 * float(blocks[:, RESIDUAL, RESIDUAL].sum())
+        cost = 0.5 * float(blocks[:, -1, -1].sum())
     return cost, blocks
 
 
@@ -219,11 +225,9 @@ def whitened_chunks(
     """
     columns = parameters.shape[-1] + turns + 5
     for chunk in measurements.chunks:
-        m, _, n = chunk.direction_icrf.shape
-        J = measurements.derivatives[: 2 * columns * m * n].reshape(2, columns, m * n)
-        own = parameters
+        J, own = measurements.derivatives(chunk, columns), parameters
         if parameters.ndim > 1:
-            own = np.repeat(parameters[chunk.image], n, axis=0).T
+            own = np.repeat(parameters[chunk.image], chunk.direction_icrf.shape[2], axis=0).T
         seen = _whitened_columns(chunk, model, own, camera_from_icrf[chunk.image], J)
         yield chunk, (J if seen else None)
 
@@ -270,13 +274,6 @@ def _whitened_columns(
     np.multiply(wvv, residual_v, out=V[-2])
     J[:, -1] = 0.0
     return True
-
-
-def turned(rotations: Floats, image: NDArray[np.int64], vectors: Floats) -> Floats:
-    """Return vectors (n, 3) turned by the rotations (m, 3, 3) of their images (n,)."""
-    # To take along an axis, and to sum along the stars, is a fifth of the time of other ways.
-    of_star = np.take(rotations.transpose(1, 2, 0), image, axis=2)
-    return np.asarray(np.einsum('ijn,jn->in', of_star, np.ascontiguousarray(vectors.T)).T)
 
 
 def squared_sigmas(residual_px: Floats, covariance_px2: Floats) -> Floats:

@@ -28,7 +28,7 @@ from scipy.special import stdtr
 
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
-from starcal_ros.estimation.amplitudes import interval_factor, LOG_SIGMA
+from starcal_ros.estimation.amplitudes import interval_factor, LogPrior
 from starcal_ros.estimation.limits import FEWEST, MOST_CORRELATED
 from starcal_ros.estimation.problem import canonical_xyzw, Problem, State
 from starcal_ros.records import StarObservations, StarTrackerAlignment
@@ -141,7 +141,7 @@ def tracker_errors(
         centre = np.zeros(len(centre))
     centre = centre + math.log(stated_slow or usual_slow)
     slow2, noise2 = np.exp(2.0 * (centre + _LOG_SLOW[:, None])), np.exp(2.0 * log_noise)
-    prior = noise_prior - 0.5 * (_LOG_SLOW[:, None] / slow_sigma) ** 2
+    prior = noise_prior + LogPrior(0.0, slow_sigma).log_density(_LOG_SLOW[:, None])
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
     within = float(((error - of_group[group]) ** 2).sum())
     log_weight, mean_information = [], []
@@ -192,11 +192,12 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     log_rms = 0.5 * math.log(max(float((error**2).mean()), 1e-300))
     more = max(math.ceil((log_rms + _BEYOND - _LOG_NOISE[-1]) / step), 0)
     log_noise: Floats = np.append(_LOG_NOISE, _LOG_NOISE[-1] + step * np.arange(1, more + 1))
-    unstated = -0.5 * (log_noise / LOG_SIGMA) ** 2
+    unstated, stated = LogPrior(0.0), LogPrior(0.0, _NOISE_SIGMA)
+    wrong, right = unstated.log_density(log_noise), stated.log_density(log_noise)
     if not is_stated:
-        return log_noise, log_noise, unstated
-    odds = math.log(_WRONG_SHEETS / (1.0 - _WRONG_SHEETS) * _NOISE_SIGMA / LOG_SIGMA)
-    right, wrong = -0.5 * (log_noise / _NOISE_SIGMA) ** 2, odds + unstated
+        return log_noise, log_noise, wrong
+    odds = _WRONG_SHEETS / (1.0 - _WRONG_SHEETS)
+    wrong = wrong + math.log(odds * stated.sigma / unstated.sigma)
     return log_noise, np.where(wrong > right, log_noise, 0.0), np.logaddexp(right, wrong)
 
 
@@ -387,7 +388,7 @@ def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:
 
 
 @dataclass(frozen=True)
-class Attitudes:
+class AttitudeErrors:
     """Errors of the star trackers as the stars show them, and their variances."""
 
     error_rad: Floats
@@ -402,7 +403,7 @@ def star_tracker_alignments(
     problem: Problem,
     state: State,
     covariance: Floats,
-    attitudes: Attitudes,
+    attitudes: AttitudeErrors,
     time_ns: Indices,
     sigma_rad: Floats,
 ) -> tuple[StarTrackerAlignment, ...]:
@@ -415,7 +416,7 @@ def star_tracker_alignments(
         From `star_tracker_names`.
     covariance : (3 + 3 s, 3 + 3 s)
         Covariance of the alignment and of the mountings of the s further star trackers.
-    attitudes : Attitudes
+    attitudes : AttitudeErrors
         Errors in images at ``time_ns`` (m,), about the axes of the star tracker of each.
     sigma_rad : (3,)
         Noise of a star tracker.
@@ -450,7 +451,7 @@ def star_tracker_alignments(
 
 
 def _drift(
-    time_ns: Indices, attitudes: Attitudes, sigma_rad: Floats, here: Mask
+    time_ns: Indices, attitudes: AttitudeErrors, sigma_rad: Floats, here: Mask
 ) -> tuple[Floats, float, float]:
     """
     Slope (3,) of the errors in time, arcsec/h; its length over the span; p-value of none.

@@ -33,7 +33,7 @@ from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD, FASTEST_M_S, SPEED_OF_LIGHT_M_S
-from starcal_ros.estimation.amplitudes import UNSTATED
+from starcal_ros.estimation.amplitudes import LogPrior
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import (
     image_alignment,
@@ -102,8 +102,8 @@ class Unknown:
         Sums (k, t, t) of their products over pixels (2, n) with weights (k, n).
     octave : (q,) or None
         Octave of each coefficient of those functions.
-    log_px : float, float
-        Prior of the logarithm of the amplitude of the first octave: mean and 1-sigma.
+    log_px : LogPrior
+        Prior of the amplitude of the first octave.
     term : (q,) or None
         A likely combination of the functions, 1 px, with an amplitude of its own besides.
     tracker : (m, 3, q) or None
@@ -125,7 +125,7 @@ class Unknown:
     functions: Scalars | None = None
     products: Callable[[Floats, Floats], Floats] | None = None
     octave: Indices | None = None
-    log_px: tuple[float, float] = UNSTATED
+    log_px: LogPrior = dataclasses.field(default_factory=LogPrior)
     term: Floats | None = None
     tracker: Floats | None = None
     widest: Floats | float = np.inf
@@ -267,8 +267,8 @@ class Assumptions:
         Offset of all stamps against the attitudes.
     refraction : Refraction or None
         About a zenith that is not known exactly; None: in space, or corrected.
-    lens_log_px : float, float
-        Logarithm of the residual of the lens: mean and 1-sigma.
+    lens_log_px : LogPrior
+        Prior of the residual of the lens.
     plausible_m_s : float
         Plausible velocity against the Earth where none is given.
     colour : (n,) or None
@@ -279,7 +279,7 @@ class Assumptions:
     readout_s: tuple[float, float]
     stamp_s: float
     refraction: Refraction | None = None
-    lens_log_px: tuple[float, float] = UNSTATED
+    lens_log_px: LogPrior = dataclasses.field(default_factory=LogPrior)
     plausible_m_s: float = np.inf
     colour: Floats | None = None
 
@@ -398,7 +398,7 @@ def moved(
 
 
 @dataclass(frozen=True)
-class Given:
+class EntryInputs:
     """Inputs of the entries: rates in the frame of the camera, size of the detector, px."""
 
     problem: Problem
@@ -430,7 +430,7 @@ def unknowns_of(
     size : (width, height)
         Of the detector, px.
     """
-    given = Given(problem, state, rates, size, assumed)
+    given = EntryInputs(problem, state, rates, size, assumed)
     made = (kind.make(given) for kind in UNKNOWNS.values() if kind.make is not None)
     entries = *unknowns_in_state(problem, state).entries, *made
     return Layout(tuple(entry for entry in entries if entry is not None and len(entry)))
@@ -457,7 +457,7 @@ def readout_rms_s(layout: Layout, mean: Floats, covariance: Floats, assumed: Ass
     return math.hypot(mean[at], covariance[at, at] ** 0.5)
 
 
-def _shape(given: Given) -> Unknown:
+def _shape(given: EntryInputs) -> Unknown:
     """
     Return the entry of the changes of the camera from image to image.
 
@@ -477,7 +477,7 @@ def _shape(given: Given) -> Unknown:
     return Unknown('shape', labels, np.ones(count), np.zeros(count), of_image=True, camera=camera)
 
 
-def _trend(given: Given) -> Unknown | None:
+def _trend(given: EntryInputs) -> Unknown | None:
     """
     Return the entry of a scale that changes in proportion to time, as that of a lens that warms.
 
@@ -494,7 +494,7 @@ def _trend(given: Given) -> Unknown | None:
     return Unknown('trend', ('scale_trend_px',), sigma, np.zeros(1), camera=modes)
 
 
-def _velocity(given: Given) -> Unknown | None:
+def _velocity(given: EntryInputs) -> Unknown | None:
     """Return the entry of the velocity of the observer."""
     if not given.assumed.velocity_m_s > 0:
         return None
@@ -509,7 +509,7 @@ def _velocity(given: Given) -> Unknown | None:
     )
 
 
-def _refraction(given: Given) -> Unknown | None:
+def _refraction(given: EntryInputs) -> Unknown | None:
     """Return the entry of the size of refraction."""
     if (air := given.assumed.refraction) is None:
         return None
@@ -518,7 +518,7 @@ def _refraction(given: Given) -> Unknown | None:
     return Unknown('refraction', label, sigma, np.zeros(1), turn=turn)
 
 
-def _site(given: Given) -> Unknown | None:
+def _site(given: EntryInputs) -> Unknown | None:
     """Return the entry of latitude and sidereal times."""
     if (air := given.assumed.refraction) is None:
         return None
@@ -527,7 +527,7 @@ def _site(given: Given) -> Unknown | None:
     return Unknown('site', air.labels, sigma, np.zeros(q), turn=turn, widest=ZENITH_SIGMA_RAD)
 
 
-def _colour(given: Given) -> Unknown | None:
+def _colour(given: EntryInputs) -> Unknown | None:
     """Return the entry of a scale that changes with the colour of the star."""
     if given.assumed.colour is None:
         return None
@@ -536,21 +536,21 @@ def _colour(given: Given) -> Unknown | None:
     return Unknown('colour', label, sigma, np.zeros(1), turn=turn, of_star=given.assumed.colour)
 
 
-def _readout(given: Given) -> Unknown | None:
+def _readout(given: EntryInputs) -> Unknown | None:
     """Return the entry of the time of read-out, which a camera that turns shows."""
     labels, sigma, offset, by_time = _timing(given, 'readout', *given.assumed.readout_s)
     turn = functools.partial(_by_readout, by_time, given.size[1])
     return Unknown('readout', labels, sigma, offset, turn=turn)
 
 
-def _stamps(given: Given) -> Unknown | None:
+def _stamps(given: EntryInputs) -> Unknown | None:
     """Return the entry of the offset of the stamps, which a camera that turns shows."""
     labels, sigma, offset, by_time = _timing(given, 'stamp_offset', 0.0, given.assumed.stamp_s)
     return Unknown('stamps', labels, sigma, offset, tracker=by_time)
 
 
 def _timing(
-    given: Given, name: str, mean_s: float, sigma_s: float
+    given: EntryInputs, name: str, mean_s: float, sigma_s: float
 ) -> tuple[tuple[str, ...], Floats, Floats, Floats]:
     """
     Return labels, 1-sigma (q,), offset (q,) and turns (m, 3, q) of a time that is not known.
@@ -571,7 +571,7 @@ def _timing(
     return labels, sigma_s * one, -mean_s * one, by_time
 
 
-def _errors_of_rates(given: Given) -> Unknown | None:
+def _errors_of_rates(given: EntryInputs) -> Unknown | None:
     """
     Return the entry of the errors of the rates: three turns of each image over its read-out.
 
@@ -621,7 +621,7 @@ def _by_readout(
     return np.asarray(np.take(turns.transpose(1, 2, 0), image, axis=2) * late)
 
 
-def _field(given: Given) -> Unknown:
+def _field(given: EntryInputs) -> Unknown:
     """
     Return the entry of the field over the detector: coefficients of cosines.
 
@@ -719,6 +719,8 @@ class Kind:
         Text of that line by the list, the posterior mean (P,) and the options.
     option : callable
         What may be stated to lower the sigma, by the list and the options.
+    needs_dates : bool
+        True if a statement of it takes effect only in images that have a date.
     remedy : str
         What else lowers it.
     in_state : bool
@@ -727,7 +729,7 @@ class Kind:
         None: the data do not test its prior.
     """
 
-    make: Callable[[Given], Unknown | None] | None = None
+    make: Callable[[EntryInputs], Unknown | None] | None = None
     cause: str = ''
     line: int = 9
     of_tracker: bool = False
@@ -735,6 +737,7 @@ class Kind:
         'estimated, no prior'
     )
     option: Callable[[Layout, CalibrationOptions], Option] = lambda *_: NO_OPTION
+    needs_dates: bool = False
     remedy: str = ''
     in_state: bool = False
     tested: PriorTest | None = None
@@ -856,6 +859,7 @@ UNKNOWNS: dict[str, Kind] = {
         cause='refraction',
         line=2,
         option=_site_option,
+        needs_dates=True,
         tested=PriorTest(
             ('latitude', 'clock'),
             'check site and UTC, or state observer: ground alone',

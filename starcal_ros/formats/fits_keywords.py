@@ -21,7 +21,7 @@ class Card(NamedTuple):
     comment: str = ''
 
 
-class Row(NamedTuple):
+class Fact(NamedTuple):
     """
     Keywords of a fact, of which the first counts; ``unit`` is empty for a text.
 
@@ -40,57 +40,57 @@ _TRIED = 'tried beside the other statements of the scale; the stars decide'
 _ABOVE = 'the stars are above the horizon'
 _INSIDE = 'lies in the image; of the size of the image: already cut'
 _SOUTH, _EAST = ('OBSGEO-B', 'SITELAT', 'LAT-OBS'), ('OBSGEO-L', 'SITELONG', 'LONG-OBS')
-FACTS: Mapping[str, Row] = {
-    'middle of the exposure': Row(('DATE-AVG', 'MJD-AVG'), 'time', _COMPARED),
-    'start of the exposure': Row(
+FACTS: Mapping[str, Fact] = {
+    'middle of the exposure': Fact(('DATE-AVG', 'MJD-AVG'), 'time', _COMPARED),
+    'start of the exposure': Fact(
         ('DATE-BEG', 'DATE-OBS', 'UT-OBS', 'MJD-BEG', 'MJD-OBS', 'JD-OBS', 'JD'),
         'time', _COMPARED,
     ),
-    'end of the exposure': Row(('DATE-END', 'MJD-END'), 'time', 'after the start'),
-    'time of day, of a date alone': Row(
+    'end of the exposure': Fact(('DATE-END', 'MJD-END'), 'time', 'after the start'),
+    'time of day, of a date alone': Fact(
         ('TIME-OBS', 'UTC-OBS', 'UT-OBS', 'UTSTART', 'UT-START', 'UTCSTART', 'UT', 'UTC'),
         '', 'all agree',
     ),
-    'time system': Row(('TIMESYS',), '', 'UTC, TAI, TT, TDB or GPS'),
-    'exposure time': Row(
+    'time system': Fact(('TIMESYS',), '', 'UTC, TAI, TT, TDB or GPS'),
+    'exposure time': Fact(
         ('XPOSURE', 'EXPTIME', 'EXPOSURE', 'EXP_TIME', 'EXPT', 'ITIME'), 's', 'positive',
         0.0, 86400.0,
     ),
-    'order of the rows': Row(('ROWORDER',), '', 'the stars, if mirrored'),
-    'mosaic': Row(('BAYERPAT', 'COLORTYP', 'CFAPAT'), '', 'levels of the four colours'),
-    'first column in the mosaic': Row(('XBAYROFF', 'BAYOFFX'), 'px', 'as the mosaic'),
-    'first row in the mosaic': Row(('YBAYROFF', 'BAYOFFY'), 'px', 'as the mosaic'),
-    'region of the image': Row(('TRIMSEC', 'DATASEC'), '', _INSIDE),
-    'region without light': Row(('BIASSEC',), '', 'a strip along an edge'),
-    'focal length': Row(('FOCALLEN', 'FOCALLENGTH', 'FOCAL'), 'mm', _TRIED, 0.1, 1e6),
-    'pixel size': Row(
+    'order of the rows': Fact(('ROWORDER',), '', 'the stars, if mirrored'),
+    'mosaic': Fact(('BAYERPAT', 'COLORTYP', 'CFAPAT'), '', 'levels of the four colours'),
+    'first column in the mosaic': Fact(('XBAYROFF', 'BAYOFFX'), 'px', 'as the mosaic'),
+    'first row in the mosaic': Fact(('YBAYROFF', 'BAYOFFY'), 'px', 'as the mosaic'),
+    'region of the image': Fact(('TRIMSEC', 'DATASEC'), '', _INSIDE),
+    'region without light': Fact(('BIASSEC',), '', 'a strip along an edge'),
+    'focal length': Fact(('FOCALLEN', 'FOCALLENGTH', 'FOCAL'), 'mm', _TRIED, 0.1, 1e6),
+    'pixel size': Fact(
         ('XPIXSZ', 'PIXSIZE1', 'XPIXELSZ', 'PIXSIZE', 'CCDXPIXE'), 'um', _TRIED, 0.1, 1000.0
     ),
-    'binning': Row(('XBINNING', 'CCDXBIN', 'CCDBINX', 'BINX', 'CCDSUM'), 'px', _TRIED, 1.0, 64.0),
-    'pixel scale': Row(
+    'binning': Fact(('XBINNING', 'CCDXBIN', 'CCDBINX', 'BINX', 'CCDSUM'), 'px', _TRIED, 1.0, 64.0),
+    'pixel scale': Fact(
         ('PIXSCALE', 'SECPIX', 'SECPIX1', 'IM_SCALE', 'PIXSCAL1'), 'arcsec', _TRIED,
         1e-3, 3600.0,
     ),
-    'step of a column on the sky, both': Row(('CD1_1', 'CD2_1'), 'deg', _TRIED),
-    'steps on the sky, both': Row(('CDELT1', 'CDELT2'), 'deg', _TRIED),
-    'turn of the steps, both': Row(('PC1_1', 'PC2_1'), '', _TRIED),
-    'right ascension': Row(
+    'step of a column on the sky, both': Fact(('CD1_1', 'CD2_1'), 'deg', _TRIED),
+    'steps on the sky, both': Fact(('CDELT1', 'CDELT2'), 'deg', _TRIED),
+    'turn of the steps, both': Fact(('PC1_1', 'PC2_1'), '', _TRIED),
+    'right ascension': Fact(
         ('CRVAL1', 'RA', 'OBJCTRA', 'RA-D', 'TELRA'), 'deg', 'stars of the catalog there',
         0.0, 360.0,
     ),
-    'declination': Row(
+    'declination': Fact(
         ('CRVAL2', 'DEC', 'OBJCTDEC', 'DEC-D', 'TELDEC'), 'deg', 'stars of the catalog there',
         -90.0, 90.0,
     ),
-    'geocentric place, all three': Row(('OBSGEO-X', 'OBSGEO-Y', 'OBSGEO-Z'), 'm', _ABOVE),
-    'latitude': Row((*_SOUTH, 'LATITUDE', 'GEOLAT', 'OBS-LAT'), 'deg', _ABOVE, -90.0, 90.0),
-    'longitude': Row((*_EAST, 'LONGITUD', 'GEOLON', 'OBS-LONG'), 'deg', _ABOVE, -180.0, 360.0),
-    'height': Row(
+    'geocentric place, all three': Fact(('OBSGEO-X', 'OBSGEO-Y', 'OBSGEO-Z'), 'm', _ABOVE),
+    'latitude': Fact((*_SOUTH, 'LATITUDE', 'GEOLAT', 'OBS-LAT'), 'deg', _ABOVE, -90.0, 90.0),
+    'longitude': Fact((*_EAST, 'LONGITUD', 'GEOLON', 'OBS-LONG'), 'deg', _ABOVE, -180.0, 360.0),
+    'height': Fact(
         ('OBSGEO-H', 'SITEELEV', 'ALT-OBS', 'HEIGHT', 'OBS-ELEV'), 'm', 'none', -500.0, 1e5
     ),
-    'saturation': Row(('SATURATE',), 'DN', 'none', 0.0),
-    'camera': Row(('TELESCOP', 'INSTRUME'), '', 'none'),
-    'kind of the frame': Row(('IMAGETYP', 'OBSTYPE', 'FRAME'), '', 'no dark, flat or bias frame'),
+    'saturation': Fact(('SATURATE',), 'DN', 'none', 0.0),
+    'camera': Fact(('TELESCOP', 'INSTRUME'), '', 'none'),
+    'kind of the frame': Fact(('IMAGETYP', 'OBSTYPE', 'FRAME'), '', 'no dark, flat or bias frame'),
 }  # fmt: skip
 
 _ANGLES = {key for row in FACTS.values() if row.unit == 'deg' for key in row.keywords}

@@ -58,8 +58,7 @@ class DetectorFrames:
         # Clipping noise below the dark level at zero would bias the background.
         below = np.minimum(dark, dark.dtype.type(self.pedestal_dn))
         raised = cv2.add(pixels, dark.dtype.type(self.pedestal_dn) - below)
-        # OpenCV's type stubs lack integer images.
-        level: Pixels = cv2.subtract(raised, dark - below)  # type: ignore[assignment]
+        level: Pixels = cv2.subtract(raised, dark - below)
         # Saturated pixels stay at the end of the range, so that they are still found.
         peak = int(pixels.max())
         full_dn = saturation_level(pixels, options, quantisation_step_dn(pixels)) or np.inf

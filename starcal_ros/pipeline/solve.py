@@ -7,7 +7,7 @@ A calibration has its provenance: software, options, catalog, prior and observat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 import dataclasses
 import hashlib
 import json
@@ -32,7 +32,6 @@ from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import errors_as, OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.estimation.unknowns import UNKNOWNS
 from starcal_ros.identification.star_finder import realigned
 from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.processes import one_blas_thread
@@ -44,7 +43,6 @@ from starcal_ros.records import (
     factored_field,
     FOUND,
     StarObservations,
-    Statement,
 )
 from starcal_ros.untrusted import regular_file
 
@@ -254,20 +252,7 @@ def _not_judged(
         ),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=budget,
-        statements=_with_dates(statements(budget, result, setup.calibration), setup),
-    )
-
-
-def _with_dates(rows: Sequence[Statement], setup: Setup) -> tuple[Statement, ...]:
-    """Statements, that of a site with the dates without which no site of images is used."""
-    if not setup.times_of:
-        return tuple(rows)
-    of_site = UNKNOWNS['refraction'].cause
-    return tuple(
-        dataclasses.replace(row, option=f'{row.option} (and dates: the images have none)')
-        if row.cause == of_site
-        else row
-        for row in rows
+        statements=statements(budget, result, setup.calibration, has_dates=not setup.times_of),
     )
 
 

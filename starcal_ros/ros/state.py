@@ -142,7 +142,7 @@ class CalibratorState:
 
         With a sentence for each that it refuses, by the number of the calibration.
         """
-        refused = {}
+        refused: dict[int, str] = {}
         for record in self._back_from(event):
             why = refusals_today(record.calibration, self._setup)
             if not why:

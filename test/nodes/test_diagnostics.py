@@ -164,7 +164,7 @@ def test_a_driver_that_stops_is_named_until_it_sends_again(vehicle: Vehicle) -> 
 
     def is_well() -> bool:
         attitudes.publish(sample)
-        return vehicle.health()[:2] == (b'\x00', 'waiting for images')
+        return tuple(vehicle.health()[:2]) == (b'\x00', 'waiting for images')
 
     vehicle.until(is_well)
 

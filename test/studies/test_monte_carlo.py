@@ -21,8 +21,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from starcal_ground.comparison import parameter_difference
-from starcal_ros.assessment.observability import map_error_px
+from starcal_ground.comparison import map_error_px, parameter_difference
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError, TooFewObservations

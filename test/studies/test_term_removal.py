@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from starcal_ground.comparison import map_error_px
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.assessment.observability import map_error_px
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import estimated_parameters

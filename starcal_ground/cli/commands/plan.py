@@ -61,7 +61,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.bags import reader
     from starcal_ground.campaign import calibrate, chosen, observe
     from starcal_ground.images.first_setup import source_of
-    from starcal_ground.planning.plan import Cone, plan_pointings, Request
+    from starcal_ground.planning.plan import Cone, plan_pointings, PlanRequest
     from starcal_ros.formats.products.product_files import write_atomically
 
     given = arguments.given(args)
@@ -70,7 +70,7 @@ def run(args: argparse.Namespace) -> int:
         read = given.photographs or reader.files_of_bags(given.paths)
         files = [*stated, *read, *filter(None, [args.pointings])]
         arguments.check_file(args.output, files)
-    request = Request(
+    request = PlanRequest(
         args.images,
         args.minimise,
         _pointings(args.pointings) if args.pointings else (),

@@ -225,7 +225,9 @@ def _coverage_notes(
     return notes
 
 
-def _scale_notes(files: Sequence[image_series.ImageFile], scale: image_series.Scale) -> list[str]:
+def _scale_notes(
+    files: Sequence[image_series.ImageFile], scale: image_series.PixelScale
+) -> list[str]:
     if scale.is_none:
         return []
     notes = [f'pixel values are {scale.offset:.9g} + {scale.step:.9g} DN']
@@ -242,7 +244,7 @@ def _write_messages(
     writer: BagWriter,
     files: Sequence[image_series.ImageFile],
     options: image_series.ImageOptions,
-    scale: image_series.Scale,
+    scale: image_series.PixelScale,
     guard: Guard,
     trackers: Mapping[str, Attitudes],
     velocities: Velocities | None,
@@ -279,7 +281,7 @@ def _prior_files(
     params: Path,
     copied: Path,
     files: Sequence[image_series.ImageFile],
-    scale: image_series.Scale,
+    scale: image_series.PixelScale,
     others: Sequence[str],
 ) -> dict[Path, str]:
     """Texts of the parameter file and of the copy of the prior camera."""

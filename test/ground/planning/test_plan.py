@@ -15,9 +15,9 @@ from starcal_ground.planning.plan import (
     expected_noise_px2,
     Plan,
     plan_pointings,
+    PlanRequest,
     Pointing,
     prospect,
-    Request,
     target,
 )
 from starcal_ground.simulation.centroids import true_observations
@@ -43,7 +43,7 @@ def ensemble() -> Ensemble:
 
 @pytest.fixture(scope='module')
 def planned(setup: Setup, ensemble: Ensemble) -> Plan:
-    return plan_pointings(ensemble, setup, Request(4, 'map'))
+    return plan_pointings(ensemble, setup, PlanRequest(4, 'map'))
 
 
 def _taken(ensemble: Ensemble, planned: Plan) -> Ensemble:
@@ -89,7 +89,7 @@ def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(setup, ensemble
     here, there = Pointing(10.0, 40.0, 5.0), Pointing(200.0, -20.0, 70.0)
 
     def sigmas(*allowed: Pointing) -> list[float]:
-        found = plan_pointings(ensemble, setup, Request(len(allowed), name, allowed))
+        found = plan_pointings(ensemble, setup, PlanRequest(len(allowed), name, allowed))
         return [found.sigma, *(step.sigma for step in found.steps)]
 
     same, pair, back = sigmas(here, here, here), sigmas(here, there), sigmas(there, here)
@@ -101,7 +101,7 @@ def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(setup, ensemble
 
 def test_a_pointing_comes_back_only_where_no_other_helps_as_much(setup, ensemble) -> None:
     """Noise of the star tracker falls with any image; its slow error asks for other attitudes."""
-    places = [step.pointing for step in plan_pointings(ensemble, setup, Request(6)).steps]
+    places = [step.pointing for step in plan_pointings(ensemble, setup, PlanRequest(6)).steps]
     assert len(set(places)) == 6
 
 
@@ -109,7 +109,7 @@ def test_a_pointing_comes_back_only_where_no_other_helps_as_much(setup, ensemble
 def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(setup, ensemble) -> None:
     allowed = tuple(Pointing(10.0 * k, 20.0, 5.0) for k in range(12))
     avoid = (Cone(0.0, 20.0, 15.0),)
-    request = Request(12, 'fx', allowed, avoid=avoid, largest_slew_deg=30.0)
+    request = PlanRequest(12, 'fx', allowed, avoid=avoid, largest_slew_deg=30.0)
     places = [step.pointing for step in plan_pointings(ensemble, setup, request).steps]
     assert len(set(places)) == len(places) > 1
     assert {one.ra_deg for one in places} <= {20.0 + 10.0 * k for k in range(10)}
@@ -120,7 +120,7 @@ def test_pointings_of_a_list_are_taken_once_and_obey_slew_and_exclusion(setup, e
 
 @pytest.mark.slow
 def test_pointings_within_a_cone(setup, ensemble) -> None:
-    request = Request(2, 'map', within=Cone(200.0, 50.0, 25.0))
+    request = PlanRequest(2, 'map', within=Cone(200.0, 50.0, 25.0))
     axis = Pointing(200.0, 50.0).icrf_from_camera.apply([0.0, 0.0, 1.0])
     for step in plan_pointings(ensemble, setup, request).steps:
         boresight = step.pointing.icrf_from_camera.apply([0.0, 0.0, 1.0])
@@ -130,7 +130,7 @@ def test_pointings_within_a_cone(setup, ensemble) -> None:
 @pytest.mark.slow
 def test_a_plan_says_when_more_images_stop_helping(setup, ensemble) -> None:
     """Of one star-poor field only, whose images repeat what is known."""
-    request = Request(40, 'k1', within=Cone(200.0, 50.0, 1.0))
+    request = PlanRequest(40, 'k1', within=Cone(200.0, 50.0, 1.0))
     found = plan_pointings(ensemble, setup, request)
     assert found.enough is not None and 1 < found.enough < 40
 
@@ -145,16 +145,16 @@ def test_a_plan_says_when_more_images_stop_helping(setup, ensemble) -> None:
 )
 def test_a_request_without_a_meaning(changed, text) -> None:
     with pytest.raises(OptionError, match=text):
-        Request(**{'images': 1, **changed})
+        PlanRequest(**{'images': 1, **changed})
 
 
 def test_no_pointing_left_and_no_estimate(setup, ensemble) -> None:
-    nowhere = Request(1, 'map', avoid=(Cone(0.0, 0.0, 180.0),))
+    nowhere = PlanRequest(1, 'map', avoid=(Cone(0.0, 0.0, 180.0),))
     with pytest.raises(OptionError, match='no pointing that is allowed shows a star'):
         plan_pointings(ensemble, setup, nowhere)
     few = dataclasses.replace(ensemble, images=ensemble.images[:1])
     with pytest.raises(TooFewObservations):
-        plan_pointings(few, setup, Request(1, 'map'))
+        plan_pointings(few, setup, PlanRequest(1, 'map'))
 
 
 _OPTIONS = CalibrationOptions()

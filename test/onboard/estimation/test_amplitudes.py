@@ -23,6 +23,7 @@ from starcal_ros.estimation.amplitudes import (
     LARGEST_FIELD_PX,
     LARGEST_SHAPE_PX,
     log_amplitudes,
+    LogPrior,
     octave_prior,
     shapes,
     ShapeSums,
@@ -73,7 +74,7 @@ def test_the_prior_of_octaves_is_a_chain() -> None:
     assert mean == pytest.approx(CENTRE + STEP * np.arange(4))
     later = np.minimum.outer(np.arange(4), np.arange(4))
     assert np.linalg.inv(precision) == pytest.approx(16.0 + later)
-    mean, precision = octave_prior(4, (math.log(0.01), 1.5))
+    mean, precision = octave_prior(4, LogPrior(math.log(0.01), 1.5))
     assert mean == pytest.approx(math.log(0.01) + STEP * np.arange(4))
     assert np.linalg.inv(precision) == pytest.approx(2.25 + later)
 
@@ -84,7 +85,7 @@ def test_a_stated_residual_of_the_lens_decides_where_the_data_do_not(
 ) -> None:
     octave = np.repeat(np.arange(3), 4)
     information, gradient = np.eye(12), np.zeros(12)
-    first = math.log(stated_px), 1.5
+    first = LogPrior(math.log(stated_px), 1.5)
     mode = field_amplitudes(information, gradient, octave, first=first)
     averaged = averaged_field(information, gradient, octave, mode, np.zeros(12), first)
     sigma_px = np.sqrt(np.diag(averaged.covariance))

@@ -13,13 +13,14 @@ from worlds import displaced, estimated, normalised_error, of_random_pointings, 
 
 from bench.narrow import bound_px, scenario_of
 from starcal_ground import calibrate
+from starcal_ground.comparison import map_error_px
 from starcal_ground.mission.export.camera_models import opencv_yaml
 from starcal_ground.mission.export.export_formats import Request
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario, scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
-from starcal_ros.assessment.observability import map_error_px, map_sigma_px
+from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import CameraModel, lens, pixel_grid
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration

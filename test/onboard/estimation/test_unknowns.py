@@ -44,7 +44,7 @@ from starcal_ros.estimation.problem import attitude_errors
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import (
     Assumptions,
-    Given,
+    EntryInputs,
     Kind,
     Layout,
     moved,
@@ -191,7 +191,7 @@ TRUE_ARCSEC = 2.0  # at 90 degrees five hundred times the Sun's: a few images sh
 def row(sigma_arcsec: float) -> Kind:
     """The deflection of light by a mass: stars move away from it."""
 
-    def make(given: Given) -> Unknown:
+    def make(given: EntryInputs) -> Unknown:
         def turn(_: Floats, directions: Floats, image: Indices) -> Floats:
             mass = np.einsum('mij,j->im', given.camera_from_icrf, MASS_ICRF)[:, image]
             turns = np.cross(directions, mass, axis=0) / (1.0 - (mass * directions).sum(axis=0))
@@ -205,6 +205,7 @@ def row(sigma_arcsec: float) -> Kind:
         cause='light by a mass',
         assumption=lambda layout, *_: f'{layout["mass"].sigma[0]:g} arcsec assumed',
         option=lambda *_: ('deflection_arcsec', 'known', 0.0),
+        needs_dates=True,
         remedy='point away from the mass',
         tested=PriorTest(('deflection',), 'state the mass', is_added=True),
     )
@@ -243,8 +244,11 @@ def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert 0.0 < part.map_arcsec < total.map_arcsec
     assert remedy_against(part.cause) == 'point away from the mass'
     # If the whole sigma came from it, none would be left where the option is stated.
-    (row,) = statements((total, dataclasses.replace(total, cause=part.cause)), found, options)
+    both = total, dataclasses.replace(total, cause=part.cause)
+    (row,) = statements(both, found, options)
     assert (row.option, row.after_arcsec) == ('deflection_arcsec', 0.0)
+    (undated,) = statements(both, found, options, has_dates=False)
+    assert undated.option == 'deflection_arcsec (and dates: the images have none)'
     assert check_of(found).passed
     wanted, more = target(found, 'deflection_arcsec'), deflected(of_random_pointings(3)).images[:1]
     now, after = prospect(found, more, options).variances([0], wanted.squares)
