@@ -13,6 +13,8 @@ from typing import Any
 
 def __getattr__(name: str) -> Any:
     """Return the function, constant or class of OpenCV of a name."""
+    if name.startswith('__'):  # what a module says of itself, such as its names to export
+        raise AttributeError(name)
     import cv2
 
     return getattr(cv2, name)
