@@ -31,7 +31,6 @@ from starcal_ros.assessment.requirements import (
     FOCAL,
     LINE_OF_SIGHT,
     MAP,
-    NOT_ENOUGH,
     POINTING,
     QUANTITIES,
     REQUIREMENTS,
@@ -514,7 +513,7 @@ def _planned(campaign: Campaign, minimise: str, check: GateCheck) -> GateCheck:
             return check  # its remedy is another
         last = significant(scale * plan.steps[-1].sigma, 2)
         unit = check.unit and f' {check.unit}'
-        words = f'{len(plan.steps)} more images reach {last}{unit}{NOT_ENOUGH}'
+        words = f'{len(plan.steps)} more images reach {last}{unit}, not enough'
     else:
         place = plan.steps[0].pointing
         words = f'{enough[0]} more images reach it (starcal plan)'

@@ -14,10 +14,10 @@ from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project_jacobians
 from starcal_ros.camera import project as project_pixels
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.limits import ROWS_AT_ONCE
 from starcal_ros.record_fields import Record
 from starcal_ros.records import Calibration, CameraGeometry, MapCovariance
 
-CHUNK = 4096  # pixels at a time: the derivatives by a field of 300 terms take 30 MB
 GRID = 25  # pixels a side over which calibrations are compared and common rotations taken
 
 
@@ -61,8 +61,8 @@ def line_of_sight_table(
     """Return the lines of sight of pixels (n, 2)."""
     columns: list[tuple[Floats, ...]] = []
     common = common_rotation(camera)
-    for first in range(0, len(pixels), CHUNK):
-        derivatives = Derivatives.at(camera, pixels[first : first + CHUNK])
+    for first in range(0, len(pixels), ROWS_AT_ONCE):
+        derivatives = Derivatives.at(camera, pixels[first : first + ROWS_AT_ONCE])
         sigmas = (
             sigma_arcsec(derivatives.covariance_rad2(covariance, J))
             for J in (derivatives.of_shape(camera, common), derivatives.J)
@@ -324,8 +324,8 @@ def line_of_sight_covariance(
     pixels = np.asarray(pixels_px, np.float64)
     flat = pixels.reshape(-1, 2)
     parts: list[Floats] = [np.empty((0, 3, 3))]
-    for k in range(0, len(flat), CHUNK):
-        derivatives = Derivatives.at(camera, flat[k : k + CHUNK])
+    for k in range(0, len(flat), ROWS_AT_ONCE):
+        derivatives = Derivatives.at(camera, flat[k : k + ROWS_AT_ONCE])
         J = derivatives.J if frame == 'star_tracker' else derivatives.of_shape(camera)
         parts.append(derivatives.covariance_rad2(calibration.map_covariance, J))
     turned = frame_from_camera @ np.concatenate(parts) @ frame_from_camera.T

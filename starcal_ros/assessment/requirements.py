@@ -38,8 +38,6 @@ from starcal_ros.untrusted import shown
 REQUIREMENTS, _NONE = 'requirements', 'none'
 LINE_OF_SIGHT, MAP, POINTING, FOCAL = 'line_of_sight', 'map', 'pointing', 'f'
 _LARGEST, _RMS = 'largest ', 'rms '  # over the detector
-NOT_ENOUGH = ', not enough'
-"""End of a remedy that does not reach the limit."""
 
 
 @dataclass(frozen=True)
@@ -231,7 +229,7 @@ class Requirement:
         before = self.sigma(calibration)
         after = falls * before
         figures = [f'{significant(one, 2)} {self.unit}' for one in (before, after)]
-        enough = '' if after <= self.limit else NOT_ENOUGH
+        enough = '' if after <= self.limit else ', not enough'
         return f': {" becomes ".join(figures)} if it is {stated.value}{enough}'
 
 

@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
+from starcal_ros.estimation.tracker_errors import groups_of
 from starcal_ros.sky.astrometry import LEAST_COSINE, SIDEREAL_RAD_S
 
 ZENITH_SIGMA_RAD = 1.0  # latitude and sidereal time may be any that have the stars in their sky
 STATED_SITE_RAD = 0.01  # a site is stated to 60 km, and a clock to two minutes
 _ONE_CLOCK_RAD = 1e-6  # sidereal times that run as the stamps do differ by rounding alone
-_MOST_TIMES = 40  # further images share the error of a sidereal time with their neighbours
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Refraction:
 
     @functools.cached_property
     def times(self) -> Indices:
-        """Number (m,) of the error of the sidereal time of each image."""
+        """Number (m,) of the error of the sidereal time of each image; neighbours share one."""
         m = len(self.zenith_icrf)
         right_ascension = np.arctan2(self.zenith_icrf[:, 1], self.zenith_icrf[:, 0])
         late_s = (self.time_ns - self.time_ns[0]) / NANOSECONDS_PER_SECOND
@@ -50,12 +50,12 @@ class Refraction:
         is_stated = self.site_sigma_rad < ZENITH_SIGMA_RAD
         if is_stated or np.abs(off - 1.0).max() < _ONE_CLOCK_RAD:
             return np.zeros(m, np.int64)
-        return np.arange(m) * min(m, _MOST_TIMES) // m
+        return groups_of(self.time_ns)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Names of the unknowns of the site."""
-        times = range(int(self.times[-1]) + 1)
+        times = range(int(self.times.max()) + 1)
         return ('latitude_rad', *(f'sidereal_time_{k + 1}_rad' for k in times))
 
     def by_size(
