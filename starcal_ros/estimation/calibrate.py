@@ -321,11 +321,11 @@ def _round(
     # Unknowns outside the state, such as a velocity, take their mean; the images follow both.
     shared = found.mean.copy()
     shared[layout.in_state] *= share
-    own = found.equations.own - found.equations.back @ shared
-    after = moved(problem, state, layout, shared, own[:, IMAGE_ROTATION])
-    left_px = residuals_px(problem, after, table, found, size)
+    taken = dataclasses.replace(found, mean=shared)
+    after = moved(problem, state, layout, shared, taken.of_images[:, IMAGE_ROTATION])
+    left_px = residuals_px(problem, after, table, taken, size)
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
-    attitudes = tracker_attitudes(data, linear, sums, found, after, judged.attitudes)
+    attitudes = tracker_attitudes(data, linear, sums, taken, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
 
 

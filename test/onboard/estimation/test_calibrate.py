@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
-from worlds import each_image, errors_of, normalised, normalised_error, with_noise  # type: ignore[import-not-found]
+from worlds import each_image, errors_of, normalised, normalised_error, options_of, with_noise  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import (
     bound_names,
@@ -31,7 +31,8 @@ from starcal_ros.estimation.options import CalibrationOptions, check_enough, est
 from starcal_ros.estimation.posterior import is_settled
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
-from studies import worlds
+from starcal_ros.sky.catalog import load_catalog
+from studies import missions, worlds
 
 SCENARIO = scenario('tiny', seed=3)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
@@ -350,6 +351,16 @@ def test_an_estimate_is_settled_where_neither_unknowns_nor_sigmas_move() -> None
     assert is_settled(still, found)
     assert not is_settled(dataclasses.replace(found, mean=0.1 * sigma), found)
     assert not is_settled(dataclasses.replace(still, working=1.1 * found.working), found)
+
+
+def test_weights_follow_the_state_that_is_taken() -> None:
+    """By the weights of whole steps, the damped steps of this campaign alternate for ever."""
+    world = missions.drawn(seed=1, mission=118, sound=False)
+    made = worlds.simulate(world, 1118)
+    chosen = options_of(made.scenario, shutter=world.shutter)
+    colours_of = load_catalog().colours_bp_rp
+    found = estimate_calibration(made.ensemble, made.scenario.prior, chosen, colours_of)
+    assert found.termination == 'converged'
 
 
 class EnoughRounds(Exception):
