@@ -237,7 +237,6 @@ def rewritten(source: Path, path: Path, order: str, outside: str, is_logged_anew
 @pytest.mark.parametrize(('is_logged_anew', 'is_cut'), [(False, False), (True, True)])
 @pytest.mark.parametrize('outside', ['', '/image', '/attitude /velocity'])
 @pytest.mark.parametrize('order', ORDERS)
-@pytest.mark.usefixtures('small_chunks')
 def test_an_image_is_read_wherever_it_is_in_the_file(
     tmp_path, small_chunks, order, outside, is_logged_anew, is_cut
 ) -> None:

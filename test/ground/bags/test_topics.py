@@ -9,6 +9,7 @@ import cv2
 from mission_files import attitudes, images, TINY, write_encoded, write_tiny, write_unread  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from sample_records import attitude_message  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground import calibrate_bag
@@ -24,10 +25,7 @@ from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     ATTITUDE_TYPE,
     IMU_TYPE,
-    make_header,
     POSE_TYPE,
-    quaternion_to_message,
-    vector_to_message,
 )
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import read_parameter_file
@@ -43,19 +41,9 @@ def setup_with(**others: object) -> Setup:
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     """Two images as rgb8 (the stars in green) and the attitudes as TransformStamped."""
-    zero = vector_to_message(np.zeros(3), make_message)
     with BagWriter(tmp_path / 'bag') as writer:
         for time_ns, xyzw in attitudes():
-            message = make_message(
-                ALIGNMENT_TYPE,
-                header=make_header(time_ns, 'icrf', make_message),
-                child_frame_id='st',
-                transform=make_message(
-                    'geometry_msgs/msg/Transform',
-                    translation=zero,
-                    rotation=quaternion_to_message(xyzw, make_message),
-                ),
-            )
+            message = attitude_message(ALIGNMENT_TYPE, time_ns, xyzw)
             writer.write('/attitude', ALIGNMENT_TYPE, time_ns, message)
         for image in images()[:2]:
             green = np.clip(image.pixels >> 4, 0, 255).astype(np.uint8)

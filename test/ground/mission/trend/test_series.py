@@ -84,17 +84,6 @@ def measured(seed: int, truth: np.ndarray) -> Trend:
     return trend_of(TIME_S, truth + noise, np.full(N, SIGMA), SEASONS)
 
 
-def by_kind(found: Trend) -> dict[str, float]:
-    return {term.kind: term.size for term in found.terms}
-
-
-@pytest.mark.slow
-def test_noise_has_no_trend_but_rarely() -> None:
-    # p-values of 1e-3 for each of three kinds of term: 0.6 findings in 200 series.
-    findings = sum(len(measured(seed, np.zeros(N)).terms) for seed in range(200))
-    assert findings <= 4
-
-
 @pytest.mark.parametrize('after', [1, 10, 30, 57])
 def test_a_step_is_found_at_its_place_and_size(after) -> None:
     found = measured(3, 1.0 * (np.arange(N) > after))
@@ -108,21 +97,15 @@ def test_a_step_is_found_at_its_place_and_size(after) -> None:
     assert 0.7 < found.scatter < 1.3
 
 
-def test_a_drift_and_a_season_are_told_apart() -> None:
-    found = measured(5, 0.2 * YEARS + 0.05 * (SEASONS - 20))
-    assert {term.kind for term in found.terms} == {'drift', 'temperature'}
-    size = by_kind(found)
-    assert size['drift'] == pytest.approx(0.2, abs=0.04)  # 4 sigma: 0.1 / (sqrt(60) * 1.44)
-    assert size['temperature'] == pytest.approx(0.05, abs=0.01)
-
-
-def test_steps_are_found_beside_a_drift_and_a_season() -> None:
+def test_a_drift_a_season_and_steps_are_told_apart() -> None:
     month = np.arange(N)
     truth = 0.3 * YEARS + 0.05 * (SEASONS - 20) + 1.5 * (month > 19) - 2.0 * (month > 40)
     found = measured(7, truth)
-    steps = {term.after: term.size for term in found.terms if term.kind == 'step'}
-    assert set(steps) == {19, 40}
-    assert steps[19] == pytest.approx(1.5, abs=0.25) and steps[40] == pytest.approx(-2.0, abs=0.25)
+    terms = {term.after if term.kind == 'step' else term.kind: term for term in found.terms}
+    expected = {19: 1.5, 40: -2.0, 'drift': 0.3, 'temperature': 0.05}
+    assert terms.keys() == expected.keys()
+    for name, size in expected.items():
+        assert abs(terms[name].size - size) < 4 * terms[name].sigma < 0.25
     assert np.abs(found.fit - truth).max() < 0.25
 
 
