@@ -137,12 +137,6 @@ def test_a_wrong_value_is_refused_by_its_key(key: str, value: object, error: str
     assert '\n' not in str(caught.value) and len(str(caught.value)) < 150
 
 
-def test_a_number_that_is_not_finite_is_null() -> None:
-    content = json_object(Knot(np.array([[np.nan, np.inf]]), np.array([1])))
-    assert content['places_px'] == [[None, None]]
-    assert np.isnan(read_record(Knot, content).places_px).all()
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 class Shown(Record):
     """A record with arrays."""

@@ -213,7 +213,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path, kind) -> None:
         calibration('plumb_bob'),
         parent_frame=f'tracker {HOSTILE}',
         child_frame=f'camera {HOSTILE}',
-        provenance={'software': HOSTILE, HOSTILE: HOSTILE},
+        provenance={'software': HOSTILE, HOSTILE: HOSTILE, 'long': 'x' * 300},
         accepted=False,
         reasons=(HOSTILE,),
         sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
@@ -226,6 +226,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path, kind) -> None:
         PARSERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
         if kind == 'spice':
             assert text.count('\\begindata') == 1
+            assert max(map(len, text.split('\n'))) <= 132  # SPICE reads no longer line
     if kind == 'c':
         command = ['gcc', '-std=c99', '-Wall', '-Wextra', '-Werror', '-c', 'starcal_camera.c']
         subprocess.run(command, cwd=tmp_path, check=True)
@@ -314,10 +315,9 @@ def test_isis_keywords_have_the_error_they_state(
     assert isis_px < 1.0
 
 
-@pytest.mark.parametrize('form', ['opencv', 'ros'])
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
-def test_an_exported_camera_is_read_as_a_prior_camera(tmp_path, form, model) -> None:
-    made = export(calibration(model, 0.0, False), form, tmp_path, Request())
-    camera = read_camera_info(tmp_path / next(iter(made.files)))
+def test_a_camera_exported_to_opencv_is_read_as_a_prior_camera(tmp_path, model) -> None:
+    made = export(calibration(model, 0.0, False), 'opencv', tmp_path, Request())
+    camera = read_camera_info(tmp_path / 'opencv.yaml')
     pixels, directions = grid_of(calibration(model, 0.0, False))
     assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6
