@@ -184,11 +184,7 @@ def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
     assert caplog.messages == said
 
 
-ODOMETRY, POSE, TF = (
-    'nav_msgs/msg/Odometry',
-    'geometry_msgs/msg/PoseWithCovarianceStamped',
-    'tf2_msgs/msg/TFMessage',
-)
+ODOMETRY, TF = 'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage'
 
 
 def of_four_images(path: Path, kind: str) -> Path:
@@ -207,7 +203,7 @@ STATED = {'prior_alignment': [0.0, 0.0, 0.0, 1.0], 'star_tracker_sigma_arcsec': 
 
 
 @pytest.mark.parametrize('stated', STATED)
-@pytest.mark.parametrize('kind', [ODOMETRY, POSE, TF, ''])
+@pytest.mark.parametrize('kind', [ODOMETRY, ''])
 def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_command(
     kind, stated, tmp_path, starcal
 ) -> None:
@@ -222,9 +218,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
         assert answer.status == status
         assert 'record the attitudes of the star tracker' in said
         assert 'starcal calibrate --camera-alone' in said
-        if kind:
-            name = kind.rpartition('/')[2]
-            assert f'/gnc/state is a {name}, which is not read: publish its orientation' in said
+        assert ('/gnc/state' in said) is bool(kind)
 
 
 @pytest.mark.parametrize(
