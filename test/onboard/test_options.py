@@ -235,17 +235,8 @@ def test_a_file_that_is_none(tmp_path: Path, text: str, says: str) -> None:
         read_parameter_file(path, ('foo',))
     assert str(refused.value).startswith(f'{path}: ') and says in str(refused.value)
     assert '\n' not in str(refused.value)
-
-
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    missing = tmp_path / 'missing.yaml'
-    with pytest.raises(OptionError, match='missing.yaml: cannot be read: No such file'):
-        read_parameter_file(missing, ('foo',))
-    with pytest.raises(OptionError, match='cannot be read: Is a directory'):
-        read_parameter_file(tmp_path, ('foo',))
-    (tmp_path / 'latin.yaml').write_bytes(b'foo: \xff\xfe\n')
-    with pytest.raises(OptionError, match='latin.yaml: not a text file'):
-        read_parameter_file(tmp_path / 'latin.yaml', ('foo',))
+    with pytest.raises(OptionError, match='none.yaml: cannot be read: No such file'):
+        read_parameter_file(tmp_path / 'none.yaml', ('foo',))
 
 
 PATHS = (
