@@ -183,8 +183,10 @@ def test_lines_of_sight_are_of_either_frame() -> None:
     expected = star_tracker_from_camera.apply(in_camera.reshape(-1, 3)).reshape(2, 2, 3)
     found = starcal_ground.lines_of_sight(geometry, pixels, frame='star_tracker')
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
-    for frame, sights in (('camera', in_camera), ('star_tracker', found)):
-        back = starcal_ground.project(geometry, 3.0 * sights, frame)
+    for back in (
+        starcal_ground.project(geometry, 3.0 * in_camera, 'camera'),
+        starcal_ground.project(geometry, 3.0 * found, 'star_tracker'),
+    ):
         np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-8)
     with pytest.raises(ValueError, match="frame: 'icrf' is not"):
         starcal_ground.lines_of_sight(geometry, pixels, frame='icrf')  # type: ignore[arg-type]
