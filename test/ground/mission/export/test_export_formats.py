@@ -315,9 +315,10 @@ def test_isis_keywords_have_the_error_they_state(
     assert isis_px < 1.0
 
 
+@pytest.mark.parametrize('form', ['opencv', 'ros'])
 @pytest.mark.parametrize('model', ['plumb_bob', 'equidistant'])
-def test_a_camera_exported_to_opencv_is_read_as_a_prior_camera(tmp_path, model) -> None:
-    made = export(calibration(model, 0.0, False), 'opencv', tmp_path, Request())
-    camera = read_camera_info(tmp_path / 'opencv.yaml')
+def test_an_exported_camera_is_read_as_a_prior_camera(tmp_path, form, model) -> None:
+    made = export(calibration(model, 0.0, False), form, tmp_path, Request())
+    camera = read_camera_info(tmp_path / next(iter(made.files)))
     pixels, directions = grid_of(calibration(model, 0.0, False))
     assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6
