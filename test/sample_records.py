@@ -11,6 +11,15 @@ from typing import Any
 import numpy as np
 
 from starcal_ros.camera import CameraModel
+from starcal_ros.formats.bag.typestore import make_message
+from starcal_ros.formats.messages.message_codec import (
+    ALIGNMENT_TYPE,
+    ATTITUDE_TYPE,
+    make_header,
+    POSE_TYPE,
+    quaternion_to_message,
+    vector_to_message,
+)
 from starcal_ros.record_fields import fields_of
 from starcal_ros.records import (
     Amplitude,
@@ -233,6 +242,28 @@ def with_needed_fields(sent: StarObservations, **others: Any) -> StarObservation
     stars = dict.fromkeys(('magnitude', 'flux_dn', 'snr'), unknown)
     size = sent.width, sent.height
     return StarObservations.of_image(sent.time_ns, size, **needed, **stars, **others)
+
+
+def attitude_message(kind: str, time_ns: int, xyzw: Any) -> Any:
+    """Return a message of a type with an attitude, and zeros beside it."""
+    rotation = quaternion_to_message(xyzw, make_message)
+    zero = vector_to_message(np.zeros(3), make_message)
+    fields: dict[str, Any] = {'header': make_header(time_ns, 'icrf', make_message)}
+    if kind == ATTITUDE_TYPE:
+        fields['quaternion'] = rotation
+    elif kind == POSE_TYPE:
+        point = make_message('geometry_msgs/msg/Point', x=1.0, y=2.0, z=3.0)
+        pose = make_message('geometry_msgs/msg/Pose', position=point, orientation=rotation)
+        fields['pose'] = pose
+    elif kind == ALIGNMENT_TYPE:
+        turn = make_message('geometry_msgs/msg/Transform', translation=zero, rotation=rotation)
+        fields |= {'child_frame_id': 'st', 'transform': turn}
+    else:
+        vectors = ('angular_velocity', 'linear_acceleration')
+        covariances = ('orientation_covariance', *(f'{name}_covariance' for name in vectors))
+        fields |= {'orientation': rotation, **dict.fromkeys(vectors, zero)}
+        fields |= dict.fromkeys(covariances, np.zeros(9))
+    return make_message(kind, **fields)
 
 
 def plain(_type: str, /, **fields: Any) -> SimpleNamespace:

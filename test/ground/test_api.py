@@ -51,16 +51,7 @@ def test_public_names_are_those_that_can_be_imported() -> None:
     assert starcal_ros.__version__.count('.') == 2
 
 
-@pytest.mark.parametrize(
-    'name',
-    [
-        'calibrate',
-        'calibrate_bag',
-        'calibrate_with_residuals',
-        'observations_of',
-        'write_calibration',
-    ],
-)
+@pytest.mark.parametrize('name', ['calibrate', 'calibrate_bag', 'write_calibration'])
 def test_an_old_name_leads_to_the_new_one(name) -> None:
     with pytest.raises(ImportError, match=f'^starcal_ros.{name} is starcal_ground.{name} now$'):
         exec(f'from starcal_ros import {name}')
@@ -192,28 +183,25 @@ def test_lines_of_sight_are_of_either_frame() -> None:
     expected = star_tracker_from_camera.apply(in_camera.reshape(-1, 3)).reshape(2, 2, 3)
     found = starcal_ground.lines_of_sight(geometry, pixels, frame='star_tracker')
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
+    for back in (
+        starcal_ground.project(geometry, 3.0 * in_camera, 'camera'),
+        starcal_ground.project(geometry, 3.0 * found, 'star_tracker'),
+    ):
+        np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-8)
     with pytest.raises(ValueError, match="frame: 'icrf' is not"):
         starcal_ground.lines_of_sight(geometry, pixels, frame='icrf')  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize('frame', ['camera', 'star_tracker'])
-def test_a_direction_is_projected_from_either_frame(frame) -> None:
-    pixels = np.array([[0.0, 0.0], [100.0, 50.0], [639.0, 511.0]])
-    sights = starcal_ground.lines_of_sight(SCENARIO.truth, pixels, frame)
-    back = starcal_ground.project(SCENARIO.truth, 3.0 * sights, frame)
-    np.testing.assert_allclose(back, pixels, rtol=0, atol=1e-8)  # as above
-
-
-@pytest.mark.parametrize(('frame', 'column'), [('camera', 1), ('star_tracker', 2)])
-def test_sigmas_of_lines_of_sight_are_those_of_the_table(tiny_products, frame, column) -> None:
+def test_sigmas_of_lines_of_sight_are_those_of_the_table(tiny_products, frame) -> None:
     calibration = starcal_ground.read_calibration(tiny_products)
     pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
     table = lookup.line_of_sight_table(
         calibration.geometry.camera, calibration.map_covariance, pixels.reshape(-1, 2)
     )
     found = starcal_ground.line_of_sight_sigma_arcsec(calibration, pixels, frame)
-    expected = (table.shape_sigma_arcsec, table.sigma_arcsec)[column - 1].reshape(2, 2)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)  # rounding
+    expected = table.shape_sigma_arcsec if frame == 'camera' else table.sigma_arcsec
+    np.testing.assert_allclose(found, expected.reshape(2, 2), rtol=1e-9)  # rounding
     # No uncertainty is along the line of sight itself.
     covariance = starcal_ground.line_of_sight_covariance(calibration, pixels, frame)
     sights = starcal_ground.lines_of_sight(calibration, pixels, frame)
@@ -241,11 +229,9 @@ def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products) -> No
 
 
 def test_records_are_not_changed_by_the_caller() -> None:
-    image = arrays(ensemble().images[0])
-    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **image)
-    held = stars.measured_px.copy()
-    mine = image['measured_px'].copy()
-    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **dict(image, measured_px=mine))
+    image = ensemble().images[0]
+    mine = image.measured_px.copy()
+    given = dict(arrays(image), measured_px=mine)
+    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **given)
     mine += 1.0
-    assert np.array_equal(stars.measured_px, held)
-    assert dataclasses.is_dataclass(stars)
+    assert np.array_equal(stars.measured_px, image.measured_px)

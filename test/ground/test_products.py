@@ -21,6 +21,7 @@ RECORD = NotCalibrated(
 
 
 def test_round_trip_without_older_products(tmp_path) -> None:
+    assert read_not_calibrated(tmp_path) is None
     kept = tmp_path / 'observations.mcap'
     for name in ('calibration.json', 'camera_info.yaml', 'residuals.npz', 'report.html'):
         (tmp_path / name).write_text('old')
@@ -28,10 +29,6 @@ def test_round_trip_without_older_products(tmp_path) -> None:
     write_not_calibrated(RECORD, tmp_path)
     assert read_not_calibrated(tmp_path) == RECORD
     assert {path.name for path in tmp_path.iterdir()} == {NOT_CALIBRATED_FILE, kept.name}
-
-
-def test_no_failure(tmp_path) -> None:
-    assert read_not_calibrated(tmp_path) is None
 
 
 @pytest.mark.parametrize('text', ['', '[]', '{"reason": "x"}', '{"images_refused": 3}'])

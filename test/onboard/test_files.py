@@ -18,15 +18,6 @@ def names(folder: Path) -> list[str]:
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_a_file_is_old_until_the_block_ends(tmp_path: Path) -> None:
-    path = tmp_path / 'a'
-    path.write_text('old')
-    with replacing(path) as file:
-        file.write(b'new')
-        assert path.read_text() == 'old'
-    assert path.read_text() == 'new' and names(tmp_path) == ['a']
-
-
 @pytest.mark.parametrize('error', [KeyboardInterrupt, OSError, SystemExit])
 def test_an_exception_leaves_the_old_file(tmp_path: Path, error: type[BaseException]) -> None:
     path = tmp_path / 'a'

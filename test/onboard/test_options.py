@@ -72,18 +72,10 @@ def test_good_values(values: dict[str, object], expected: Sample) -> None:
 @pytest.mark.parametrize(
     ('values', 'text'),
     [
-        ({'yes': 1}, 'yes: 1 is not true or false'),
-        ({'count': 2.5}, 'count: 2.5 is not a whole number'),
-        ({'count': 0}, 'count: 0 is not within 1 to 10'),
-        ({'count': 11}, 'count: 11 is not within 1 to 10'),
         ({'count': None}, 'count: None is not a whole number'),
         ({'count': math.nan}, 'count: nan is not a whole number'),
-        ({'size_px': math.inf}, 'size_px: inf is not a finite number'),
         ({'size_px': 0.49}, 'size_px: 0.49 is not at least 0.5'),
         ({'size_px': [1.0]}, 'size_px: [1.0] is not a number'),
-        ({'kind': 'c'}, "kind: 'c' is not one of a, b"),
-        ({'name': 3.0}, 'name: 3.0 is not a text'),
-        ({'axes': [1.0, 2.0]}, 'axes: 2 numbers, not 3'),
         ({'axes': 1.0}, 'axes: 1.0 is not a list, such as [1.0]'),
         ({'axes': [1.0, 2.0, -1.0]}, 'axes[2]: -1.0 is not at least 0.0'),
         ({'axes': [1.0, 2.0, math.nan]}, 'axes[2]: nan is not a finite number'),
@@ -92,6 +84,7 @@ def test_good_values(values: dict[str, object], expected: Sample) -> None:
     ],
 )
 def test_bad_values(values: dict[str, object], text: str) -> None:
+    """Beside those that `test_record_fields` draws for each option."""
     with pytest.raises(OptionError) as refused:
         from_mapping(Sample, values)
     assert str(refused.value) == text
@@ -242,17 +235,8 @@ def test_a_file_that_is_none(tmp_path: Path, text: str, says: str) -> None:
         read_parameter_file(path, ('foo',))
     assert str(refused.value).startswith(f'{path}: ') and says in str(refused.value)
     assert '\n' not in str(refused.value)
-
-
-def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
-    missing = tmp_path / 'missing.yaml'
-    with pytest.raises(OptionError, match='missing.yaml: cannot be read: No such file'):
-        read_parameter_file(missing, ('foo',))
-    with pytest.raises(OptionError, match='cannot be read: Is a directory'):
-        read_parameter_file(tmp_path, ('foo',))
-    (tmp_path / 'latin.yaml').write_bytes(b'foo: \xff\xfe\n')
-    with pytest.raises(OptionError, match='latin.yaml: not a text file'):
-        read_parameter_file(tmp_path / 'latin.yaml', ('foo',))
+    with pytest.raises(OptionError, match='none.yaml: cannot be read: No such file'):
+        read_parameter_file(tmp_path / 'none.yaml', ('foo',))
 
 
 PATHS = (

@@ -7,6 +7,7 @@ import math
 
 import pytest
 
+from starcal_ros.constants import utc_text
 from starcal_ros.text import p_value_text, printable, significant, to_sigma
 
 
@@ -57,3 +58,15 @@ def test_a_value_has_two_digits_of_its_sigma() -> None:
     assert to_sigma(0.075857993, 0.014) == '0.076'
     assert to_sigma(0.00019383623, 4e-05, '+') == '+0.000194'
     assert to_sigma(2000.123456, 0.0) == to_sigma(2000.123456, math.nan) == '2000.1235'
+
+
+@pytest.mark.parametrize(
+    ('time_ns', 'text'),
+    [
+        (1_778_829_600_012_999_999, '2026-05-15 07:20:00.012 UTC'),
+        (-1, '1969-12-31 23:59:59.999 UTC'),
+        (10**30, f'{10**30} ns'),
+    ],
+)
+def test_a_stamp_is_a_date_where_the_calendar_has_it(time_ns: int, text: str) -> None:
+    assert utc_text(time_ns) == text

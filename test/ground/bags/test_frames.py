@@ -135,13 +135,12 @@ def test_no_order_of_recording_changes_a_frame_unreported(tmp_path_factory, data
 
 
 @pytest.mark.parametrize('order', ['last', 'first', 'alone'])
-@pytest.mark.parametrize('speed_m_s', [np.nan, np.inf, 3e8])
-def test_bad_velocities_are_left_out_and_reported_once(tmp_path, order, speed_m_s) -> None:
-    """NaN, inf or light speed in a bag ended in a traceback of the images."""
+def test_bad_velocities_are_left_out_and_reported_once(tmp_path, order) -> None:
+    """A velocity that is no number ended in a traceback of the images."""
     with BagWriter(tmp_path / 'bag') as writer:
         for second in range(10):
             bad = order == 'alone' or (second > 4) == (order == 'last')
-            speeds = np.array([0.0, speed_m_s if bad else 7.0, 0.0])
+            speeds = np.array([0.0, np.nan if bad else 7.0, 0.0])
             writer.write_velocity('/velocity', second * 10**9, speeds, 'icrf')
     told: list[str] = []
     read = read_telemetry([tmp_path / 'bag'], TOPICS, on_damage=told.append)
@@ -237,7 +236,6 @@ def rewritten(source: Path, path: Path, order: str, outside: str, is_logged_anew
 @pytest.mark.parametrize(('is_logged_anew', 'is_cut'), [(False, False), (True, True)])
 @pytest.mark.parametrize('outside', ['', '/image', '/attitude /velocity'])
 @pytest.mark.parametrize('order', ORDERS)
-@pytest.mark.usefixtures('small_chunks')
 def test_an_image_is_read_wherever_it_is_in_the_file(
     tmp_path, small_chunks, order, outside, is_logged_anew, is_cut
 ) -> None:

@@ -9,6 +9,7 @@ import cv2
 from mission_files import attitudes, images, TINY, write_encoded, write_tiny, write_unread  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from sample_records import attitude_message  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground import calibrate_bag
@@ -24,10 +25,7 @@ from starcal_ros.formats.messages.message_codec import (
     ALIGNMENT_TYPE,
     ATTITUDE_TYPE,
     IMU_TYPE,
-    make_header,
     POSE_TYPE,
-    quaternion_to_message,
-    vector_to_message,
 )
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.options import read_parameter_file
@@ -43,19 +41,9 @@ def setup_with(**others: object) -> Setup:
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
     """Two images as rgb8 (the stars in green) and the attitudes as TransformStamped."""
-    zero = vector_to_message(np.zeros(3), make_message)
     with BagWriter(tmp_path / 'bag') as writer:
         for time_ns, xyzw in attitudes():
-            message = make_message(
-                ALIGNMENT_TYPE,
-                header=make_header(time_ns, 'icrf', make_message),
-                child_frame_id='st',
-                transform=make_message(
-                    'geometry_msgs/msg/Transform',
-                    translation=zero,
-                    rotation=quaternion_to_message(xyzw, make_message),
-                ),
-            )
+            message = attitude_message(ALIGNMENT_TYPE, time_ns, xyzw)
             writer.write('/attitude', ALIGNMENT_TYPE, time_ns, message)
         for image in images()[:2]:
             green = np.clip(image.pixels >> 4, 0, 255).astype(np.uint8)
@@ -196,11 +184,7 @@ def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
     assert caplog.messages == said
 
 
-ODOMETRY, POSE, TF = (
-    'nav_msgs/msg/Odometry',
-    'geometry_msgs/msg/PoseWithCovarianceStamped',
-    'tf2_msgs/msg/TFMessage',
-)
+ODOMETRY, TF = 'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage'
 
 
 def of_four_images(path: Path, kind: str) -> Path:
@@ -219,7 +203,7 @@ STATED = {'prior_alignment': [0.0, 0.0, 0.0, 1.0], 'star_tracker_sigma_arcsec': 
 
 
 @pytest.mark.parametrize('stated', STATED)
-@pytest.mark.parametrize('kind', [ODOMETRY, POSE, TF, ''])
+@pytest.mark.parametrize('kind', [ODOMETRY, ''])
 def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_command(
     kind, stated, tmp_path, starcal
 ) -> None:
@@ -234,9 +218,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
         assert answer.status == status
         assert 'record the attitudes of the star tracker' in said
         assert 'starcal calibrate --camera-alone' in said
-        if kind:
-            name = kind.rpartition('/')[2]
-            assert f'/gnc/state is a {name}, which is not read: publish its orientation' in said
+        assert ('/gnc/state' in said) is bool(kind)
 
 
 @pytest.mark.parametrize(

@@ -126,22 +126,18 @@ def test_a_colour_of_a_mosaic_has_half_the_size(tmp_path, bayer, channel, first)
 
 
 MIDDLE = '2026-05-15T07:20:00.5'
-
-
 START = {'DATE-OBS': '2026-05-15T07:20:00'}
 
 
 @pytest.mark.parametrize(
     ('header', 'why'),
     [
-        (START, '--time-key DATE-OBS'),
         ({'DATE-AVG': 'yesterday'}, 'yesterday'),
         (
             {'DATE-OBS': '2026-05-15', 'UT': '07:20:00', 'TIME-OBS': '09:20:00', 'EXPTIME': 1},
             'TIME-OBS, UT differ: give --time-key or --times',
         ),
         ({'DATE-OBS': '2026-05-15', 'UT': 26400.0, 'EXPTIME': 1.0}, 'T26400.0. is not a date'),
-        ({**START, 'EXPTIME': -1}, 'EXPTIME = -1 is not the duration'),
         ({**START, 'EXPTIME': 0.0}, 'EXPTIME = 0.0 is not the duration'),
         ({**START, 'EXPTIME': 'long'}, 'EXPTIME = long is not the duration'),
         # Free text may say anything: only brackets are a unit (FITS standard 4.0, 4.3.2).
@@ -196,16 +192,13 @@ def test_temperature_and_saturation_come_from_the_header(tmp_path) -> None:
 
 
 def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path) -> None:
-    for side, shape in ((60000, (9, 9)), (11585, (9, 9, 4))):
-        _, png = cv2.imencode('.png', np.zeros(shape, np.uint16))
-        content = bytearray(png.tobytes())
-        content[16:24] = struct.pack('>II', side, side)  # width and height of its header
-        content[29:33] = struct.pack('>I', zlib.crc32(content[12:29]))
-        (tmp_path / 'a.png').write_bytes(content)
-        with pytest.raises(
-            IngestError, match=rf'a\.png: its header claims {side} x {side} pixels'
-        ):
-            look(tmp_path / 'a.png', PLAIN)
+    side, four_colours = 11585, np.zeros((9, 9, 4), np.uint16)
+    content = bytearray(cv2.imencode('.png', four_colours)[1].tobytes())
+    content[16:24] = struct.pack('>II', side, side)  # width and height of its header
+    content[29:33] = struct.pack('>I', zlib.crc32(content[12:29]))
+    (tmp_path / 'a.png').write_bytes(content)
+    with pytest.raises(IngestError, match=rf'a\.png: its header claims {side} x {side} pixels'):
+        look(tmp_path / 'a.png', PLAIN)
     tiled = fits.CompImageHDU(np.zeros((9, 9), np.uint8))
     tiled.writeto(tmp_path / 'a.fits')
     content = bytearray((tmp_path / 'a.fits').read_bytes())
@@ -215,20 +208,6 @@ def test_an_image_that_claims_gigabytes_is_not_decoded(tmp_path) -> None:
     (tmp_path / 'a.fits').write_bytes(content)
     with pytest.raises(IngestError, match=r'a\.fits: no image of up to'):
         look(tmp_path / 'a.fits', PLAIN)
-
-
-def test_a_png_that_inflates_to_far_more_is_not_decoded(tmp_path) -> None:
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return (
-            struct.pack('>I', len(data)) + name + data + struct.pack('>I', zlib.crc32(name + data))
-        )
-
-    size = struct.pack('>IIBBBBB', 64, 64, 8, 0, 0, 0, 0)
-    surplus = zlib.compress(bytes(1 << 26))
-    content = chunk(b'IHDR', size) + chunk(b'IDAT', surplus) + chunk(b'IEND', b'')
-    (tmp_path / 'a.png').write_bytes(b'\x89PNG\r\n\x1a\n' + content)
-    with pytest.raises(IngestError, match=r'a\.png: inflates to far more than its pixels'):
-        look(tmp_path / 'a.png', ImageOptions(times={'a.png': 1}))
 
 
 def test_images_of_two_sizes_or_one_time_are_refused(tmp_path) -> None:

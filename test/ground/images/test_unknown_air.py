@@ -30,6 +30,7 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.refraction import Refraction
+from starcal_ros.options import from_mapping
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import CameraGeometry, Ensemble, HeldTerm, StarObservations
 from starcal_ros.sky.astrometry import (
@@ -89,10 +90,7 @@ def seen_from(
 
 
 def estimate(images: Sequence[StarObservations]) -> Estimate:
-    known = {f.name for f in dataclasses.fields(CalibrationOptions)}
-    options = CalibrationOptions(
-        **{k: v for k, v in options_of({}).items() if k in known}  # type: ignore[arg-type]
-    )
+    options = from_mapping(CalibrationOptions, options_of({}))
     used = tuple(one for one in images if not one.refusal)
     prior = CameraGeometry(CAMERA, np.array([0.0, 0.0, 0.0, 1.0]))
     return estimate_calibration(Ensemble(used), prior, options)

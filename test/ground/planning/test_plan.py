@@ -138,7 +138,6 @@ def test_a_plan_says_when_more_images_stop_helping(setup, ensemble) -> None:
 @pytest.mark.parametrize(
     ('changed', 'text'),
     [
-        ({'pointings': (Pointing(1.0, 91.0),)}, 'not a direction'),
         ({'avoid': (Cone(math.nan, 0.0, 5.0),)}, 'not a direction'),
         ({'within': Cone(0.0, 0.0, 200.0)}, 'the radius is not within'),
     ],

@@ -28,6 +28,7 @@ from starcal_ros.assessment.lookup import (
     lines_of_sight,
 )
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import write_calibration
 from starcal_ros.records import Calibration, factored_field, MapCovariance, SigmaPart
@@ -35,7 +36,6 @@ from starcal_ros.records import Calibration, factored_field, MapCovariance, Sigm
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]  # compilers run
 WARNINGS = ['-Wall', '-Wextra', '-Werror', '-pedantic']
 SANITIZERS = ['-g', '-fsanitize=address,undefined', '-fno-sanitize-recover=all']
-MODELS = ['plumb_bob', 'rational_polynomial', 'thin_prism', 'tilted', 'equidistant']
 DRIVER = Path(__file__).with_name('check_camera.c')
 # Of a unit vector: some ten roundings of the lens, and its inverse to 1e-14.
 SAME_DIRECTION = 1e-12
@@ -169,7 +169,7 @@ def check_slopes(
 
 
 @pytest.mark.parametrize('with_field', [False, True])
-@pytest.mark.parametrize('model', MODELS)
+@pytest.mark.parametrize('model', LENSES)
 def test_c_gives_the_numbers_of_python(tmp_path, model, with_field) -> None:
     made = with_correlations(calibration(model, with_field=with_field, temperature=True))
     program = built(made, tmp_path, level='-O1' if with_field else '-O0')

@@ -213,7 +213,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path, kind) -> None:
         calibration('plumb_bob'),
         parent_frame=f'tracker {HOSTILE}',
         child_frame=f'camera {HOSTILE}',
-        provenance={'software': HOSTILE, HOSTILE: HOSTILE},
+        provenance={'software': HOSTILE, HOSTILE: HOSTILE, 'long': 'x' * 300},
         accepted=False,
         reasons=(HOSTILE,),
         sigma_budget=(SigmaPart(HOSTILE, 1.0, 1.0, HOSTILE),),
@@ -226,6 +226,7 @@ def test_hostile_names_leave_every_format_valid(tmp_path, kind) -> None:
         PARSERS.get(path.suffix, str)(text.removeprefix('%YAML:1.0\n'))
         if kind == 'spice':
             assert text.count('\\begindata') == 1
+            assert max(map(len, text.split('\n'))) <= 132  # SPICE reads no longer line
     if kind == 'c':
         command = ['gcc', '-std=c99', '-Wall', '-Wextra', '-Werror', '-c', 'starcal_camera.c']
         subprocess.run(command, cwd=tmp_path, check=True)

@@ -9,19 +9,16 @@ import math
 from pathlib import Path
 from typing import Any
 
-from hypothesis import given, HealthCheck, settings
-from hypothesis import strategies as st
 import numpy as np
 import pytest
 from sample_records import assert_same, calibration, plain_calibration, without_field  # type: ignore[import-not-found]
 
-from starcal_ros.camera import CameraModel
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE
 from starcal_ros.formats.messages.record_messages import calibration_to_message
 from starcal_ros.formats.products.product_files import read_calibration, write_calibration
-from starcal_ros.records import CameraGeometry, GateCheck, TemperatureTerms
+from starcal_ros.records import GateCheck, TemperatureTerms
 
 GATE = (
     GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
@@ -38,59 +35,12 @@ def test_calibration_comes_back_to_the_last_bit(tmp_path: Path) -> None:
         {'accepted': False, 'reasons': ('too few stars', 'weak: k3')},
         {'temperature': TemperatureTerms(20.0, note='left out: everything')},
         {'model_checks': dataclasses.replace(calibration().model_checks, held=())},
+        {'gate': GATE},
     )
     records = (dataclasses.replace(plain_calibration(), **changes) for changes in cases)
     for record in (calibration(), without_field(), *records):
         write_calibration(record, tmp_path / 'calibration.json')
         assert_same(record, read_calibration(tmp_path / 'calibration.json'))
-
-
-def test_the_checks_of_the_gate_come_back(tmp_path: Path) -> None:
-    path = tmp_path / 'c.json'
-    write_calibration(dataclasses.replace(calibration(), gate=GATE), path)
-    assert [check['passed'] for check in json.loads(path.read_text())['gate']] == [
-        True,
-        False,
-        None,
-    ]
-    assert repr(read_calibration(path).gate) == repr(GATE)  # NaN is not equal to itself
-
-
-finite = st.floats(allow_nan=False, allow_infinity=False)
-
-
-@pytest.mark.slow
-@settings(
-    max_examples=50,
-    derandomize=True,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture],
-)
-@given(
-    fx=st.floats(1e3, 1e7),
-    others=st.lists(st.floats(-1e-3, 1e-3), min_size=8, max_size=8),
-    covariance=st.lists(finite, min_size=169, max_size=169),
-    quaternion=st.tuples(*[st.floats(0.1, 1.0)] * 4),
-    number=finite,
-)
-def test_any_finite_number_comes_back(
-    tmp_path: Path,
-    fx: float,
-    others: list[float],
-    covariance: list[float],
-    quaternion: tuple[float, ...],
-    number: float,
-) -> None:
-    parameters = np.array([fx, others[0], fx, *others[1:]])
-    rotation = np.array(quaternion) / np.linalg.norm(quaternion)
-    record = dataclasses.replace(
-        plain_calibration(),
-        geometry=CameraGeometry(CameraModel(1296, 1024, parameters), rotation),
-        covariance=np.array(covariance).reshape(13, 13),
-        residual_rms_px=number,
-    )
-    write_calibration(record, tmp_path / 'c.json')
-    assert_same(record, read_calibration(tmp_path / 'c.json'))
 
 
 def test_numbers_that_are_not_finite_are_null_and_come_back_nan(tmp_path: Path) -> None:
@@ -125,8 +75,10 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
     } <= set(content)  # fmt: skip
     assert content['image'] == {'width': 1296, 'height': 1024}
     assert content['temperature'] is content['maps'] is content['correlation'] is None
-    write_calibration(calibration(), path)
-    assert list(json.loads(path.read_text())['temperature']) == [
+    write_calibration(dataclasses.replace(calibration(), gate=GATE), path)
+    content = json.loads(path.read_text())
+    assert [check['passed'] for check in content['gate']] == [True, False, None]
+    assert list(content['temperature']) == [
         'reference_degc', 'focal_per_degc', 'focal_per_degc_sigma',
         'alignment_rate_rad_per_degc', 'alignment_rate_rad_per_degc_sigma', 'note',
     ]  # fmt: skip
@@ -178,7 +130,6 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
         # Before the field over the detector takes gigabytes.
         (lambda c: c['image'].update(height=2_000_000), 'image size: .* is over 65536 px'),
-        (lambda c: c.update(images_used=2**70), 'images_used: .* is not within 64 bit'),
         (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
         (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
         (lambda c: c.update(intrinsics=3), 'intrinsics: 3 is not an object'),
@@ -214,14 +165,12 @@ def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says
 
 
 def test_files_that_are_none_are_named(tmp_path: Path) -> None:
-    for content in (b'', b'{', b'[]', b'\xff\xfe\x00', b'3'):
+    for content in (b'{', b'[]', b'3'):
         (tmp_path / 'c.json').write_bytes(content)
         with pytest.raises(ProductError, match=r'c\.json: .*not') as caught:
             read_calibration(tmp_path / 'c.json')
         assert '\n' not in str(caught.value)
     with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
         read_calibration(tmp_path / 'none')
-    with pytest.raises(ProductError, match='the folder holds no calibration.json'):
-        read_calibration(tmp_path)
     with pytest.raises(ProductError, match='cannot be written'):
         write_calibration(calibration(), tmp_path / 'none' / 'c.json')
