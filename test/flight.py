@@ -9,12 +9,17 @@ import time
 from typing import Any
 
 from forked_process import ForkedNode  # type: ignore[import-not-found]
-from node_campaign import Campaign  # type: ignore[import-not-found]
 import numpy as np
 
 from bench import graph
+from bench.frames import history, render_frame, write_set_up
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
+from starcal_ground.simulation import scenario
 from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.records import StarObservations
 
 _FIRST_NS = 1_778_829_600_000_000_000
 _STEP_NS = 1_000_000_000
@@ -241,3 +246,20 @@ class Flight:
         status = message.status[0]
         node = status.name.removeprefix('starcal: ')
         self._health[node] = {value.key: value.value for value in status.values}
+
+
+class Campaign:
+    """Ten small frames, their observations, and the parameter file for nodes."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.scenario = scenario.scenario('tiny')
+        self.params = write_set_up(self.scenario, folder)
+        self.log = folder / 'log'
+        self.frames = [render_frame(self.scenario, index) for index in range(10)]
+        self.setup = load_setup(read_parameter_file(self.params, ()))
+        self.observations: list[StarObservations] = []
+        track = observe.Track(self.setup.prior)
+        for image, samples in self.frames:
+            found, track = observe.observe_next(image, history(samples), self.setup, track)
+            self.observations.append(found)

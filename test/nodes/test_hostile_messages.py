@@ -13,12 +13,11 @@ from typing import Any
 
 from attacks import BAG, calibration, many, observations  # type: ignore[import-not-found]
 import cv2
-from flight import Flight  # type: ignore[import-not-found]
+from flight import Campaign, Flight  # type: ignore[import-not-found]
 from geometry_msgs.msg import QuaternionStamped, TransformStamped, TwistStamped
 from lifecycle_msgs.srv import ChangeState, GetState
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 from mutants import is_decodable, mutated, not_finite  # type: ignore[import-not-found]
-from node_campaign import Campaign  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue

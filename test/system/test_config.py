@@ -3,12 +3,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 from pathlib import Path
 import re
 import shutil
+from typing import Any
 
 import pytest
-from tool_modules import tool  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.cli.main import main
@@ -18,6 +19,15 @@ from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, read
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'
+
+
+def tool(name: str) -> Any:
+    """A module of the folder tools, which is no package."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / 'tools' / f'{name}.py')
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 def test_parameter_file_is_up_to_date() -> None:

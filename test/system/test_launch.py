@@ -2,7 +2,7 @@
 """
 The launch files, by their syntax tree: launch is not on PyPI, so they cannot be run here.
 
-`test_faults.py` starts the same nodes with the arguments of launch_ros.
+`test_nodes.py` starts the same nodes with the arguments of launch_ros.
 """
 
 from __future__ import annotations
