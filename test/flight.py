@@ -75,11 +75,6 @@ class Flight:
         """Number of images with an answer."""
         return len(self._answered_ns)
 
-    @property
-    def numbers(self) -> int:
-        """Number of calibrations that have been active."""
-        return len(self._known)
-
     def __enter__(self) -> Flight:
         from diagnostic_msgs.msg import DiagnosticArray
         from geometry_msgs.msg import QuaternionStamped
@@ -252,7 +247,6 @@ class Campaign:
     """Ten small frames, their observations, and the parameter file for nodes."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
         self.scenario = scenario.scenario('tiny')
         self.params = write_set_up(self.scenario, folder)
         self.log = folder / 'log'

@@ -33,8 +33,10 @@ OF_EXTRAS = ('dask', 'distributed', 'sphinx', 'spiceypy')
 PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
 
 
-def run(*command: str | Path, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*map(str, command)], cwd=cwd, capture_output=True, text=True)
+def run(
+    *command: str | Path, cwd: Path = ROOT, env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True)
 
 
 def required(installed: metadata.Distribution, extra: str) -> set[str]:
@@ -202,11 +204,6 @@ def vehicle(tmp_path: Path) -> dict[str, str]:
     return os.environ | {'PYTHONPATH': f'{tmp_path}:{ROOT}'}
 
 
-def run_in(environment: dict[str, str], *words: str | Path) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, *map(str, words)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-
-
 @pytest.mark.nodes
 def test_the_nodes_run_and_what_needs_more_costs_one_line(vehicle) -> None:
     pytest.importorskip('starcal.msg')
@@ -223,7 +220,7 @@ try:
 except ArchiveError as error:
     print(error)
 """
-    done = run_in(vehicle, '-c', source)
+    done = run(sys.executable, '-c', source, env=vehicle)
     assert done.returncode == 0, done.stderr
     assert 'python -m pip install mcap rosbags, or leave state_dir' in done.stdout
     params = TINY / 'params.yaml'
@@ -231,7 +228,7 @@ except ArchiveError as error:
         ('starcal_ros.entry_points', 'bag_player'),
         ('starcal_ground.cli.main', 'calibrate', TINY, '--params', params, '-o', 'none'),
     ):
-        refused = run_in(vehicle, '-m', *words)
+        refused = run(sys.executable, '-m', *words, env=vehicle)
         assert refused.returncode == 2, refused.stderr
         assert 'python -m pip install mcap rosbags' in refused.stderr
         assert refused.stderr.count('\n') == 1
@@ -259,6 +256,6 @@ def test_without_ros_the_debian_build_says_where_it_stops(tmp_path) -> None:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
         copy(ROOT / name, tmp_path / name)
     build = ('debian/rules', 'build', f'ROS_PREFIX={tmp_path}/none')
-    done = subprocess.run(build, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = run(*build, cwd=tmp_path)
     assert done.returncode == 2
     assert f'no ROS 2 in {tmp_path}/none' in done.stderr
