@@ -14,8 +14,8 @@ import subprocess
 import sys
 from typing import Any
 
+from mission_files import params_with  # type: ignore[import-not-found]
 import pytest
-import yaml
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -118,12 +118,9 @@ def test_launch_arguments_are_shown(make) -> None:
 
 def test_replay_launch(make, tiny_bag, tmp_path) -> None:
     ros2 = make(FAST)
-    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
-    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
-    remapped = tmp_path / 'images.yaml'
-    remapped.write_text(yaml.safe_dump(values))
+    params = params_with(tmp_path, state_dir=str(tmp_path / 'state'))
     launch = ros2.start(
-        *('launch', 'starcal', 'replay.launch.py', f'params:={remapped}', f'bag:={tiny_bag}'),
+        *('launch', 'starcal', 'replay.launch.py', f'params:={params}', f'bag:={tiny_bag}'),
         *('rate:=0.0', 'loop:=false', 'image:=/opnav/image_raw'),
         'attitude:=/star_tracker/attitude',
     )
@@ -146,10 +143,7 @@ def test_a_wrong_launch_argument_leaves_no_process(
 ) -> None:
     """The launch ends by itself, and the nodes with it: another calibrator can have the folder."""
     ros2 = make(FAST)
-    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
-    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
-    params = tmp_path / 'params.yaml'
-    params.write_text(yaml.safe_dump(values))
+    params = params_with(tmp_path, state_dir=str(tmp_path / 'state'))
     files = (f'params_file:={params}', f'bag:={tiny_bag}')
     launch = ros2.start('launch', 'starcal', 'replay.launch.py', *files, argument)
     launch.wait()
