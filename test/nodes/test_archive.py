@@ -79,6 +79,7 @@ def test_the_ensemble_is_a_bag_and_no_metadata_lacks_an_image(tmp_path: Path) ->
     (tmp_path / 'ensemble/metadata.yaml').write_text('of ros2 bag reindex')
     with opened(tmp_path) as archive:
         archive.keep(Ensemble((*archive.read_ensemble().images, images()[2])), ())
+    assert not (tmp_path / 'ensemble/metadata.yaml').exists()
     found = list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))
     assert [one.time_ns for one in found] == [one.time_ns for one in images()[:3]]
 

@@ -254,6 +254,8 @@ withheld -> none | no calibration is active
     activate a 0.25; limit 0.01; open A; rollback
 withheld with another mounting -> none | no calibration is active
     activate a; turn 90; open A; rollback
+withheld in memory -> none | no calibration is active
+    open -; activate a 0.25; limit 0.01; open -; rollback
 relaxed again -> a | refused by the gate: largest change
     activate a 0.25; limit 0.01; open A; limit 0.3; open A; solve b 2
 during a solve -> a | not activated: the node was cleaned up meanwhile
