@@ -77,6 +77,20 @@ def digests(folder: Path) -> dict[str, str]:
     }
 
 
+def _sparse(path: Path) -> None:
+    with path.open('wb') as file:
+        file.truncate(1 << 40)
+
+
+NO_FILES: dict[str, Callable[[Path], object]] = {
+    'pipe': os.mkfifo,
+    'device': lambda path: path.symlink_to('/dev/zero'),
+    'sparse': _sparse,
+    'dangling link': lambda path: path.symlink_to('nothing'),
+    'folder': Path.mkdir,
+}
+"""What may stand where a file of starcal or of a user is expected, made at a path, by name."""
+
 _DEEP: object = json.loads('[' * 900 + ']' * 900)
 _ODD: list[object] = [
     None, True, False, 0, -1, 1, 0.5, 1e300, -1e300, 1e-300, 1e20, 2**31, 2**32, 2**63, 10**20,

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Fixtures for tests with nodes: a separate ROS domain, node processes, a client."""
+"""Fixtures: a separate ROS domain, node processes, a client; the tool; the small bag."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ import socket
 from forked_process import ForkedChild  # type: ignore[import-not-found]
 import hypothesis
 import pytest
+from starcal_tool import Answer, Starcal  # type: ignore[import-not-found]
 from vehicle import Client, NodeProcess, StartNode, Vehicle  # type: ignore[import-not-found]
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
@@ -49,7 +50,7 @@ LONGEST = (
     *('test_lens_models', 'test_object_store', 'test_end_to_end', 'test_unknown_air'),
     *('test_centroiding', 'test_c_camera', 'test_series_overview', 'test_trend', 'test_state'),
     *('test_hostile_state', 'test_ros_tools', 'test_hostile_messages', 'test_plan'),
-    *('test_calibrator_camera_driver', 'test_paper', 'test_examples'),
+    *('test_calibrator', 'test_paper', 'test_examples'),
 )
 
 
@@ -201,6 +202,22 @@ def start_node(
         process.end()
         if failed:
             print(f'{process.name}, exit status {process.process.returncode}:\n{process.said()}')
+
+
+@pytest.fixture
+def starcal(capsys: pytest.CaptureFixture[str]) -> Starcal:
+    """Run the tool with words of a command line; the answer has what it prints from then on."""
+    from starcal_ground.cli.main import main
+
+    def run(*words: object) -> Answer:
+        capsys.readouterr()
+        try:
+            status = main([str(word) for word in words])
+        except SystemExit as ended:  # argparse's way out
+            status = int(str(ended.code or 0))
+        return Answer(status, *capsys.readouterr())
+
+    return run
 
 
 @pytest.fixture

@@ -8,13 +8,21 @@ from pathlib import Path
 import time
 from typing import Any
 
-from forked_process import ForkedNode  # type: ignore[import-not-found]
-from node_campaign import Campaign  # type: ignore[import-not-found]
+from geometry_msgs.msg import QuaternionStamped
 import numpy as np
+from sensor_msgs.msg import Image
+from std_srvs.srv import Trigger
+from vehicle import BOTH, Client, NodeProcess, Vehicle  # type: ignore[import-not-found]
 
-from bench import graph
+from bench.frames import history, render_frame, write_set_up
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
+from starcal_ground.simulation.scenario import scenario
 from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
+from starcal_ros.options import read_parameter_file
+from starcal_ros.pipeline import observe
+from starcal_ros.pipeline.setup import load_setup
+from starcal_ros.ros.node import make_message
 
 _FIRST_NS = 1_778_829_600_000_000_000
 _STEP_NS = 1_000_000_000
@@ -27,103 +35,69 @@ _SAME_PX = 0.5
 
 class Flight:
     """
-    Both nodes with images and requests in flight, and the record of their answers.
+    Both nodes with ten small frames and requests in flight, whose answers are checked.
 
-    ``lost`` counts images that the calibrator reported as saved but did not have after a restart,
-    and images that a running star observer has but does not answer.  ``undelivered`` counts those
-    that it says it does not have: a process that is killed while it holds a lock in the memory
-    that Fast DDS shares may stop the transport of the others.  ``wrong`` counts latched
-    calibrations that the gate refused, that are older than a previous one, or whose number had
-    another content; and stars measured at a wrong place, or a star observer that does not use a
-    latched calibration after a restart.
+    A calibrator has after a restart each image that it reported as saved. A running star observer
+    answers each image that it has; ``undelivered`` counts those that it says it does not have: a
+    process that is killed while it holds a lock in the memory that Fast DDS shares may stop the
+    transport of the others. A latched calibration has passed the gate, is no older than the one
+    before, and its number stands for one content. Stars are measured at their places, and a star
+    observer uses the latched calibration after a restart.
     """
 
-    NODES = ('star_observer', 'calibrator')
-
-    def __init__(self, campaign: Campaign, state: Path) -> None:
-        self._campaign = campaign
-        kept = (f'state_dir:={state}', 'max_images:=5000')
-        self._values = {'star_observer': (), 'calibrator': kept}
-        self._running: dict[str, Any] = {}
+    def __init__(self, vehicle: Vehicle, folder: Path) -> None:
+        self._vehicle = vehicle
+        given = scenario('tiny')
+        params = write_set_up(given, folder)
+        self._frames = [render_frame(given, index) for index in range(10)]
+        self._truth: list[dict[int, Any]] = []  # pixels of the stars of each frame
+        setup = load_setup(read_parameter_file(params, ()))
+        track = observe.Track(setup.prior)
+        for image, samples in self._frames:
+            found, track = observe.observe_next(image, history(samples), setup, track)
+            places = zip(found.catalog_id.tolist(), found.measured_px, strict=True)
+            self._truth.append(dict(places))
+        common = ('--params-file', str(params), '--log-level', 'warn')
+        kept = ('-p', f'state_dir:={folder / "state"}', '-p', 'max_images:=5000')
+        self._arguments = {'star_observer': common, 'calibrator': (*common, *kept)}
+        self._running: dict[str, NodeProcess] = {}
         self._names: dict[str, str] = {}
+        self._kills: Counter[str] = Counter()
         self._known: dict[int, list[float]] = {}  # content of the calibrations by number
         self._status: list[Any] = []
         self._latched: list[Any] = []
-        self._health: dict[str, dict[str, str]] = {}
-        self._answered_ns: set[int] = set()
         self._in_flight_ns: set[int] = set()
         self._solving: Any = None
         self._solve: Any = None
-        self.sent = self.reported = 0
-        self.kills: Counter[str] = Counter()
-        self.lost: Counter[str] = Counter()
-        self.undelivered: Counter[str] = Counter()
-        self.wrong: Counter[str] = Counter()
-        self.died: Counter[str] = Counter()
-        self._truth = [
-            dict(zip(one.catalog_id.tolist(), one.measured_px, strict=True))
-            for one in campaign.observations
-        ]
-
-    @property
-    def answered(self) -> int:
-        """Number of images with an answer."""
-        return len(self._answered_ns)
-
-    @property
-    def numbers(self) -> int:
-        """Number of calibrations that have been active."""
-        return len(self._known)
-
-    def __enter__(self) -> Flight:
-        from diagnostic_msgs.msg import DiagnosticArray
-        from geometry_msgs.msg import QuaternionStamped
-        from sensor_msgs.msg import Image
-
-        from starcal.msg import StarObservations
-
-        self._client = graph.Client()
+        self.answered_ns: set[int] = set()
+        self.sent = self.reported = self.undelivered = 0
+        vehicle.node.create_subscription(StarObservations, 'observations', self._take, 5000)
+        self._images = vehicle.node.create_publisher(Image, 'image', 20)
         # A small message waits behind a large one of the same participant: use a second one.
-        self._tracker = graph.Client('star_tracker')
-        self._client.collect(StarObservations, 'observations', self._take, latched=False)
-        self._client.collect(DiagnosticArray, '/diagnostics', self._take_health, latched=False)
-        self._images = self._client.node.create_publisher(Image, 'image', 20)
+        self._tracker = Client('star_tracker')
         self._attitudes = self._tracker.node.create_publisher(QuaternionStamped, 'attitude', 1000)
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        for process in self._running.values():
-            graph.stop(process)
-        self._tracker.__exit__()
-        self._client.__exit__()
+    def close(self) -> None:
+        """Leave the graph; the nodes are ended by their fixture."""
+        self._tracker.close()
 
     def fly(self, seconds: float) -> None:
         """Start missing nodes, then send images and request calibrations for a time."""
-        from std_srvs.srv import Trigger
-
-        missing = [name for name in self.NODES if name not in self._running]
+        missing = [name for name in BOTH if name not in self._running]
         for name in missing:
             self._start(name)
-        for name in missing:
-            is_observer = name == 'star_observer'
-            if not (self._observer_is_ready() if is_observer else self._calibrator_is_ready()):
-                self._running.pop(name).kill()
-                self.died[name] += 1
-                return
+        if 'star_observer' in missing:
+            self._until_observer_is_ready()
+        if 'calibrator' in missing:
+            self._until_calibrator_is_ready()
         if self._known:
-            newest = str(max(self._known))
-            mine = self._names['star_observer']
-            taken = self._client.holds(
-                lambda: int(self._said(mine, 'calibration', 'prior', '0')) >= int(newest)
-            )
-            self.wrong['star_observer'] += not taken
-        end_s = time.monotonic() + seconds
-        first = self.sent
+            self._vehicle.until(lambda: self._number_in_use() >= max(self._known))
+        end_s, first = time.monotonic() + seconds, self.sent
         while time.monotonic() < end_s or self.sent == first:
             self._send()
-            if not self._client.holds(lambda: len(self._in_flight_ns) < _IN_FLIGHT, _ANSWER_S):
-                count = self.lost if self._observer_holds_images() else self.undelivered
-                count['star_observer'] += len(self._in_flight_ns)
+            if not self._vehicle.holds(lambda: len(self._in_flight_ns) < _IN_FLIGHT, _ANSWER_S):
+                assert not self._observer_holds_images(), f'no answer: {self._in_flight_ns}'
+                self.undelivered += len(self._in_flight_ns)
                 self._in_flight_ns.clear()
             if self._solving is None or self._solving.done():
                 self._solving = self._solve.call_async(Trigger.Request())
@@ -131,88 +105,78 @@ class Flight:
     def kill_at_start(self, name: str, seconds: float) -> None:
         """Kill a node during its start, before or after it has read its state."""
         self._start(name)
-        self._client.holds(lambda: self._running[name].poll() is not None, seconds)
+        process = self._running[name].process
+        self._vehicle.holds(lambda: process.poll() is not None, seconds)
         self.kill(name)
 
     def kill(self, *names: str) -> None:
         """Kill nodes at once, and check the messages that they have published."""
         for name in names:
-            self._running[name].kill()
+            self._running[name].process.kill()
         for name in names:
-            self.died[name] += self._running.pop(name).wait() != -9
-            self.kills[name] += 1
-        self._client.holds(lambda: False, 0.1)  # messages in flight
+            ended = self._running.pop(name)
+            assert ended.wait() == -9, ended.said()
+            self._kills[name] += 1
+        self._vehicle.holds(lambda: False, 0.1)  # messages in flight
         if 'star_observer' in names:
             self._in_flight_ns.clear()
         if 'calibrator' in names:
             self._solving = None
         self.reported = max([self.reported, *(message.images_saved for message in self._status)])
         for message in self._latched:
-            if not message.number:  # none is active: only before the first
-                self.wrong['calibrator'] += bool(self._known)
+            if not message.number:
+                assert not self._known, 'none is active only before the first'
                 continue
             content = [*message.camera.parameters, *message.covariance]
-            self.wrong['calibrator'] += not message.accepted
-            self.wrong['calibrator'] += self._known.setdefault(message.number, content) != content
+            assert message.accepted
+            assert self._known.setdefault(message.number, content) == content
         self._status.clear()
         self._latched.clear()
 
     def _start(self, name: str) -> None:
         # A new name for each process: a dead node stays in the graph for 20 s.
-        self._names[name] = f'{name}{self.kills[name]}'
-        log = self._campaign.log
-        log.touch()
-        arguments = ['--ros-args', '--params-file', str(self._campaign.params)]
-        arguments += [word for value in self._values[name] for word in ('-p', value)]
-        arguments += ['-r', f'__node:={self._names[name]}', '--log-level', 'warn']
-        self._running[name] = ForkedNode(name, arguments, log)
+        self._names[name] = f'{name}{self._kills[name]}'
+        named = ('-r', f'__node:={self._names[name]}')
+        self._running[name] = self._vehicle.start_node(name, *self._arguments[name], *named)
 
-    def _observer_is_ready(self) -> bool:
-        """Return True once it is matched and answers; earlier images do not count as lost."""
-        mine, before = self._names['star_observer'], self.answered
-        if not self._client.holds(lambda: int(self._said(mine, 'listeners', '', '0')) >= 1):
-            return False
-        for _ in range(int(_ANSWER_S)):
+    def _until_observer_is_ready(self) -> None:
+        """Wait until it is matched and answers; earlier images do not count as lost."""
+        self._vehicle.until_listened(self._names['star_observer'])
+        before = len(self.answered_ns)
+
+        def answers_an_image() -> bool:
             self._send()
-            if self._client.holds(lambda: self.answered > before, 1.0):
-                self._in_flight_ns.clear()
-                return True
-        return False
+            return bool(self._vehicle.holds(lambda: len(self.answered_ns) > before, 1.0))
+
+        self._vehicle.until(answers_an_image)
+        self._in_flight_ns.clear()
+
+    def _until_calibrator_is_ready(self) -> None:
+        vehicle = self._vehicle
+        self._status = vehicle.latched(EnsembleStatus, 'ensemble_status')
+        self._latched = vehicle.latched(Calibration, 'calibration')
+        service = f'{self._names["calibrator"]}/calibrate'
+        self._solve = vehicle.node.create_client(Trigger, service)
+        vehicle.until(lambda: self._status and self._solve.service_is_ready())
+        assert self._status[0].images >= self.reported
+        if self._known:
+            vehicle.until(lambda: self._latched)
+            assert self._latched[0].number >= max(self._known)
+
+    def _number_in_use(self) -> int:
+        """Number of the calibration that the star observer predicts with; 0 for the prior."""
+        value = self._vehicle.health(self._names['star_observer'])[2].get('calibration', 'prior')
+        return 0 if value == 'prior' else int(value)
 
     def _observer_holds_images(self) -> bool:
         """Return what a new report says; True if none comes."""
-        mine = self._names['star_observer']
-        self._health.pop(mine, None)
-        self._client.holds(lambda: mine in self._health)
-        return self._said(mine, 'images_waiting', '', '1') != '0'
-
-    def _calibrator_is_ready(self) -> bool:
-        from std_srvs.srv import Trigger
-
-        from starcal.msg import Calibration, EnsembleStatus
-
-        client = self._client
-        client.collect(EnsembleStatus, 'ensemble_status', self._status.append, latched=True)
-        client.collect(Calibration, 'calibration', self._latched.append, latched=True)
-        self._solve = client.node.create_client(Trigger, f'{self._names["calibrator"]}/calibrate')
-        if not client.holds(lambda: self._status and self._solve.service_is_ready()):
-            return False
-        self.lost['calibrator'] += max(0, self.reported - self._status[0].images)
-        if self._known:
-            client.holds(lambda: self._latched)
-            newest = self._latched[0].number if self._latched else 0
-            self.wrong['calibrator'] += newest < max(self._known)
-        return True
-
-    def _said(self, node: str, key: str, none: str, instead: str) -> str:
-        """Value of the newest diagnostics of a node."""
-        value = self._health.get(node, {}).get(key, instead)
-        return instead if value == none else value
+        vehicle, mine = self._vehicle, self._names['star_observer']
+        vehicle.forget_health()
+        vehicle.holds(lambda: vehicle.health(mine)[2])
+        return bool(vehicle.health(mine)[2].get('images_waiting') != '0')
 
     def _send(self) -> None:
-        from starcal_ros.ros.node import make_message
-
-        image, samples = self._campaign.frames[self.sent % len(self._campaign.frames)]
+        image, samples = self._frames[self.sent % len(self._frames)]
         time_ns = _FIRST_NS + self.sent * _STEP_NS
         for around_ns in _AROUND_NS:
             xyzw = samples[1].icrf_from_star_tracker_xyzw
@@ -225,19 +189,13 @@ class Flight:
         self._in_flight_ns.add(time_ns)
         self.sent += 1
 
-    def _take(self, message: Any) -> None:
+    def _take(self, message: StarObservations) -> None:
         time_ns = stamp_ns(message.header.stamp)
-        self._answered_ns.add(time_ns)
+        self.answered_ns.add(time_ns)
         self._in_flight_ns.discard(time_ns)
         truth = self._truth[(time_ns - _FIRST_NS) // _STEP_NS % len(self._truth)]
         measured = np.reshape(message.measured_px, (-1, 2))
         for star, place in zip(message.catalog_id, measured, strict=True):
             known = truth.get(star)
             # A star near the limit may be found in only one of the passes.
-            if known is not None and np.abs(known - place).max() > _SAME_PX:
-                self.wrong['star_observer'] += 1
-
-    def _take_health(self, message: Any) -> None:
-        status = message.status[0]
-        node = status.name.removeprefix('starcal: ')
-        self._health[node] = {value.key: value.value for value in status.values}
+            assert known is None or np.abs(known - place).max() <= _SAME_PX, star

@@ -11,6 +11,7 @@ from typing import Any
 from attacks import drawn  # type: ignore[import-not-found]
 from hypothesis import given
 from hypothesis import strategies as st
+from rclpy.serialization import deserialize_message, serialize_message
 
 _INTEGERS = re.compile(r'(u?)int(8|16|32|64)')
 _ARRAY = re.compile(r'(.+)\[(\d+)\]')
@@ -19,8 +20,6 @@ _SEQUENCE = re.compile(r'sequence<(.+?)(?:, (\d+))?>')
 
 def mutated(template: Any, count: int) -> list[tuple[Any, type[Any]]]:
     """Draw mutants of a message, one in sixteen as bytes, each with the type of the message."""
-    from rclpy.serialization import serialize_message
-
     whole = serialize_message(template)
     mutants_so_far: list[tuple[Any, type[Any]]] = []
 
@@ -35,8 +34,6 @@ def mutated(template: Any, count: int) -> list[tuple[Any, type[Any]]]:
 
 def is_decodable(mutant: tuple[Any, type[Any]]) -> bool:
     """True for a message, and for bytes that are one."""
-    from rclpy.serialization import deserialize_message
-
     message, kind = mutant
     if not isinstance(message, bytes):
         return True

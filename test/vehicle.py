@@ -109,13 +109,13 @@ def _seen(condition: Callable[..., object]) -> str:
 class Client:
     """A rclpy node that waits for conditions instead of sleeping."""
 
-    def __init__(self) -> None:
+    def __init__(self, name: str = 'client') -> None:
         import rclpy
         from rclpy.executors import SingleThreadedExecutor
 
         self._context = rclpy.Context()
         rclpy.init(context=self._context)
-        self.node = rclpy.create_node('client', context=self._context)
+        self.node = rclpy.create_node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
         self._diagnostics: list[Any] | None = None
@@ -124,10 +124,16 @@ class Client:
 
     def until(self, condition: Callable[[], object], timeout_s: float = START_S) -> None:
         """Spin until a condition holds; fail after the timeout."""
+        assert self.holds(condition, timeout_s), f'timeout with {_seen(condition)}'
+
+    def holds(self, condition: Callable[[], object], timeout_s: float = START_S) -> bool:
+        """Spin until a condition holds; False after the timeout."""
         deadline_s = time.monotonic() + timeout_s
         while not condition():
-            assert time.monotonic() < deadline_s, f'timeout with {_seen(condition)}'
+            if time.monotonic() > deadline_s:
+                return False
             self._executor.spin_once(timeout_sec=0.05)
+        return True
 
     def call(
         self,
@@ -209,6 +215,11 @@ class Client:
                     assert len(dict(pairs)) == len(pairs), 'a key twice'
                     return status.level, status.message, dict(pairs)
         return b'', '', {}
+
+    def forget_health(self) -> None:
+        """Leave out diagnostics that came before."""
+        if self._diagnostics is not None:
+            self._diagnostics.clear()
 
     def until_value(self, key: str, value: str, name: str = 'star_observer') -> None:
         """Wait for a value in the diagnostics of a node."""

@@ -1,8 +1,13 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The state folder: what was kept comes back, through kills and damage; seals of its files."""
+"""
+The state folder: what was kept comes back, through kills and damage; seals of its files.
+
+Files that cannot be read, beside damaged ones: what is not known is not harmed.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 import contextlib
 import dataclasses
 import json
@@ -10,8 +15,10 @@ import multiprocessing
 import os
 from pathlib import Path
 import shutil
+import tempfile
 import time
 
+from attacks import NO_FILES  # type: ignore[import-not-found]
 from kept_state import activation, collect, images, opened  # type: ignore[import-not-found]
 import numpy as np
 import pytest
@@ -65,21 +72,16 @@ def test_another_image_of_a_stamp_on_disk_takes_its_place(tmp_path: Path) -> Non
             assert_same(a, b)
 
 
-def test_the_ensemble_is_a_bag(tmp_path: Path) -> None:
-    with opened(tmp_path) as archive:
-        archive.keep(Ensemble(images()[:12]), ())
-    found = list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))
-    assert [one.time_ns for one in found] == [one.time_ns for one in images()[:12]]
-
-
-def test_no_metadata_lacks_an_image(tmp_path: Path) -> None:
+def test_the_ensemble_is_a_bag_and_no_metadata_lacks_an_image(tmp_path: Path) -> None:
     """A description that another program left is removed: all images are read."""
     with opened(tmp_path) as archive:
         archive.keep(Ensemble(images()[:2]), ())
     (tmp_path / 'ensemble/metadata.yaml').write_text('of ros2 bag reindex')
     with opened(tmp_path) as archive:
         archive.keep(Ensemble((*archive.read_ensemble().images, images()[2])), ())
-    assert len(list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))) == 3
+    assert not (tmp_path / 'ensemble/metadata.yaml').exists()
+    found = list(bag_reader.read_observations([tmp_path / 'ensemble'], TOPIC))
+    assert [one.time_ns for one in found] == [one.time_ns for one in images()[:3]]
 
 
 def test_the_last_number_ends_with_the_remedy(tmp_path: Path) -> None:
@@ -233,11 +235,6 @@ def test_what_is_no_folder_is_refused(tmp_path: Path) -> None:
             Archive(path, 'camera')
 
 
-@pytest.mark.parametrize('seal', [CHECKSUMS, KEYED])
-def test_a_sealed_object_comes_back(seal: Seal) -> None:
-    assert seal.opened(seal.sealed(CONTENT).encode()) == CONTENT
-
-
 def test_a_checksum_can_be_made_again_and_an_hmac_only_with_the_key() -> None:
     forged = {**CONTENT, 'number': 4}
     text = CHECKSUMS.sealed(forged).encode()
@@ -247,7 +244,9 @@ def test_a_checksum_can_be_made_again_and_an_hmac_only_with_the_key() -> None:
     other = Seal(b'another sixteen.').sealed(forged).encode()
     with pytest.raises(ValueError, match='the HMAC is wrong'):
         KEYED.opened(other)
-    assert CHECKSUMS.opened(KEYED.sealed(CONTENT).encode()) == CONTENT  # the key was taken away
+    sealed = KEYED.sealed(CONTENT).encode()
+    assert KEYED.opened(sealed) == CONTENT
+    assert CHECKSUMS.opened(sealed) == CONTENT  # the key was taken away
 
 
 @pytest.mark.parametrize('data', [b'', b'[]', b'{}', b'3', b'\xff', b'[' * 10**5, b'{"a": 1}'])
@@ -279,3 +278,76 @@ def test_the_key_file(tmp_path: Path) -> None:
     for name in ('fifo', 'none', '.'):
         with pytest.raises(OptionError, match='state_key_file'):
             read_seal(str(tmp_path / name))
+
+
+NOBODY = 65534
+IMAGE, REFUSED = 'ensemble/00000001.mcap', 'ensemble/refused.json'
+EVENT = 'calibrations/00000002_calibration_00000002.json'
+
+
+STOPS, SKIPPED, SET_ASIDE = 'cannot be read', 'not a regular file, skipped', 'set aside'
+# What is at a name of the folder in place of a sound file, and what a start makes of it.
+CASES = [
+    *(('no access', name, STOPS) for name in (IMAGE, REFUSED, EVENT, 'ensemble', 'calibrations')),
+    *(('folder', name, SKIPPED) for name in (IMAGE, REFUSED, EVENT)),
+    *((kind, name, SKIPPED) for kind in ('dangling link', 'pipe') for name in (IMAGE, EVENT)),
+    *(('cut', name, SET_ASIDE) for name in (IMAGE, REFUSED, EVENT)),
+]
+
+
+def spoil(path: Path, kind: str) -> None:
+    if kind == 'no access':
+        path.chmod(0)
+    elif kind == 'cut':
+        os.truncate(path, path.stat().st_size // 2)
+    else:
+        path.unlink()
+        NO_FILES[kind](path)
+
+
+def start(folder: Path) -> tuple[str, list[str]]:
+    """Error and damage of a start with a state folder."""
+    try:
+        with contextlib.closing(Archive(folder, 'camera')) as archive:
+            archive.read_ensemble(), archive.read_history()
+            return '', archive.damage
+    except ArchiveError as error:
+        return str(error), []
+
+
+@contextlib.contextmanager
+def as_nobody() -> Iterator[None]:
+    """The process as a user who owns none of the files; as it is where it may not change that."""
+    with contextlib.ExitStack() as stack:
+        if os.geteuid() == 0:  # modes stop any other user already
+            os.seteuid(NOBODY)
+            stack.callback(os.seteuid, 0)
+        yield
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(('kind', 'name', 'outcome'), CASES)
+def test_only_what_was_read_and_is_wrong_is_set_aside(kind: str, name: str, outcome: str) -> None:
+    """The start ends where a file may be sound; nothing is renamed then."""
+    with tempfile.TemporaryDirectory() as place:  # others have no access to that of pytest
+        folder = Path(place) / 'state'
+        with opened(folder) as archive:
+            history = (activation(1), activation(2, before=1))
+            archive.keep(Ensemble(images()[:2], {'no_stars': 1}), history)
+        start(folder)  # loads all that a start needs while this user may
+        spoil(folder / name, kind)
+        for path in (Path(place), folder, *folder.iterdir()):
+            if path.stat().st_mode & 0o777:
+                path.chmod(0o777)  # anybody may rename the files
+        with as_nobody():
+            error, damage = start(folder)
+        for path in folder.iterdir():
+            path.chmod(0o700)
+        damaged = sorted(folder.glob('*/*.damaged'))
+        aside = [path.relative_to(folder).as_posix() for path in damaged]
+    if outcome == STOPS:
+        assert f'{folder / name} cannot be read: Permission denied; start the' in error
+        assert aside == [] and error.count('\n') == 0
+    else:
+        assert error == '' and len(damage) == 1 and outcome in damage[0]
+        assert aside == ([f'{name}.damaged'] if outcome == SET_ASIDE else [])

@@ -13,7 +13,16 @@ import shutil
 import tempfile
 import time
 
-from attacks import bag_setup, calibration, CHANGES, digests, drawn, observations, with_changes  # type: ignore[import-not-found]
+from attacks import (  # type: ignore[import-not-found]
+    bag_setup,
+    calibration,
+    CHANGES,
+    digests,
+    drawn,
+    NO_FILES,
+    observations,
+    with_changes,
+)
 from hypothesis import given
 import pytest
 
@@ -134,28 +143,18 @@ def test_what_is_sealed_with_the_key_is_used(keyed: Path) -> None:
         assert state.active is not None and len(state.ensemble.images) == 2
 
 
-def _sparse(path: Path) -> None:
-    with path.open('wb') as file:
-        file.truncate(1 << 40)
-
-
+_IMAGE = 'ensemble/00000003.mcap'
 _EVENT = 'calibrations/00000003_calibration_00000003.json'
-STRANGE: dict[str, Callable[[Path], object]] = {
-    '/dev/zero as image': lambda f: (f / 'ensemble/00000003.mcap').symlink_to('/dev/zero'),
-    '/dev/zero as calibration': lambda f: (f / _EVENT).symlink_to('/dev/zero'),
-    '10^20_x': lambda f: (f / f'calibrations/{10**20}_x').write_text(''),
-    '10^20 as event': lambda f: (
-        f / f'calibrations/{10**20}_calibration_{10**20}.json'
-    ).write_text('{}'),
-    '10^20 as image': lambda f: (f / f'ensemble/{10**20}.mcap').write_text(''),
-    '999999999 as event': lambda f: (
-        f / 'calibrations/999999999_calibration_00000001.json'
-    ).write_text('{}'),
-    'Arabic digits': lambda f: (f / 'ensemble/٠٠٠٠٠٠٠٣.mcap').write_text(''),
-    'no UTF-8': lambda f: Path(os.fsdecode(bytes(f) + b'/ensemble/\xff\xfe.mcap')).write_text(''),
-    'new line in a name': lambda f: (f / 'ensemble/00000003\n.mcap').write_text(''),
-    'a TB as image': lambda f: _sparse(f / 'ensemble/00000003.mcap'),
-    'a TB as calibration': lambda f: _sparse(f / _EVENT),
+STRANGE: dict[str, tuple[str, Callable[[Path], object]]] = {
+    **{f'a {kind} as image': (_IMAGE, NO_FILES[kind]) for kind in ('device', 'sparse')},
+    **{f'a {kind} as calibration': (_EVENT, NO_FILES[kind]) for kind in ('device', 'sparse')},
+    '10^20_x': (f'calibrations/{10**20}_x', Path.touch),
+    '10^20 as event': (f'calibrations/{10**20}_calibration_{10**20}.json', Path.touch),
+    '10^20 as image': (f'ensemble/{10**20}.mcap', Path.touch),
+    '999999999 as event': ('calibrations/999999999_calibration_00000001.json', Path.touch),
+    'Arabic digits': ('ensemble/٠٠٠٠٠٠٠٣.mcap', Path.touch),
+    'no UTF-8': (os.fsdecode(b'ensemble/\xff\xfe.mcap'), Path.touch),
+    'new line in a name': ('ensemble/00000003\n.mcap', Path.touch),
 }
 
 
@@ -180,7 +179,8 @@ def test_nothing_behind_a_link_is_removed(name: str, sound: Path, tmp_path: Path
 def test_names_and_files_that_a_calibrator_never_writes(name: str, sound: Path) -> None:
     with copied(sound) as folder:
         before = digests(folder)
-        STRANGE[name](folder)
+        place, make = STRANGE[name]
+        make(folder / place)
         before = {name: old for name, old in before.items() if (folder / name).is_file()}
         state = restarted(folder)
         assert state.active is not None and passes_the_gate(state)

@@ -40,8 +40,6 @@ full A, full B -> 0 1 | a
     open A; full; images 0 1; activate a; open B; room
 A, full A, A -> 0 1 | b a
     open A; images 0; activate a; full; images 1; activate b; close; room; open A
-A, full A, B -> 0 1 | b a
-    open A; images 0; activate a; full; images 1; activate b; close; room; open B
 A, full A, memory, B -> 0 1 2 | a
     open A; images 0; full; images 1; activate a; open -; images 2; room; open B
 # With and without a folder.
@@ -51,8 +49,6 @@ A, memory, A -> 0 1 | m a
     open A; images 0; activate a; open -; images 1; activate m; open A
 A, B, A -> 0 1 2 | b a
     open A; images 0; activate a; open B; images 1; activate b; open A; images 2
-A, memory, B, A -> 0 1 | b m
-    open A; images 0; open -; images 1; activate m; open B; activate b; open A
 # A folder with records of its own: the later activation is active.
 earlier A and memory -> 0 1 2 | m a
     P2 open A; P2 images 0 1; P2 activate a; P2 close; open -; images 1 2; activate m; open A
@@ -81,13 +77,9 @@ reset on full A, A -> 2 | a
     open A; images 0 1; activate a; full; reset; images 2; close; room; open A
 reset on full A, B -> 2 | none
     open A; images 0 1; full; reset; images 2; room; open B
-reset on full A, B, A -> 2 | none
-    open A; images 0 1; full; reset; images 2; close; room; open B; open A
 reset on A that cannot be emptied, A -> 2 | a
     open A; images 0 1; activate a; touch A/ensemble.emptied; reset; images 2; close;
     remove A/ensemble.emptied; open A
-reset in memory, A -> 2 | none
-    open A; images 0 1; open -; reset; images 2; open A
 reset in B, A -> none | none
     open A; images 0 1; open B; reset; open A
 reset in B, restart, B, A -> none | none

@@ -1,17 +1,21 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""The nodes as processes: services, refusals, faults, parameters, signals."""
+"""The nodes as processes: services, refusals, faults, parameters, signals; replay; permissions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
+import functools
+import importlib.util
 import json
 from pathlib import Path
 import signal
 import subprocess
 import sys
 from typing import Any, TYPE_CHECKING
+from xml.etree import ElementTree
 
+from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import QuaternionStamped
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager  # type: ignore[import-not-found]
 import numpy as np
@@ -34,7 +38,7 @@ from vehicle import (  # type: ignore[import-not-found]
 )
 import yaml
 
-from starcal.msg import Calibration, StarObservations
+from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
 from starcal_ground.bag_writer import (
     attitude_to_message,
@@ -45,7 +49,7 @@ from starcal_ground.bag_writer import (
 from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
 from starcal_ros.formats.messages import message_codec
-from starcal_ros.formats.messages.message_codec import make_header
+from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
 from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     calibration_to_message,
@@ -372,22 +376,16 @@ def test_a_signal_while_python_imports(name: str) -> None:
 PLAYER = ('bag_player',)
 
 
-def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tuple[str, ...]]:
-    """ROS arguments for a changed copy of the parameter file of the bag."""
-
-    def arguments(folder: Path, scratch: Path) -> tuple[str, ...]:
-        text = change((folder / 'params.yaml').read_text())
-        (scratch / 'params.yaml').write_text(text)
-        return ('--params-file', str(scratch / 'params.yaml'))
-
-    return arguments
+def broken_file(_: Path, scratch: Path) -> tuple[str, ...]:
+    """ROS arguments for a parameter file that is no YAML."""
+    (scratch / 'params.yaml').write_text('/**:\n  ros__parameters: {psf: {a: [1, b')
+    return ('--params-file', str(scratch / 'params.yaml'))
 
 
 @pytest.mark.parametrize(
     ('names', 'arguments', 'text'),
     [
         (BOTH, lambda f, _: parameters(f, 'max_attitude_gap_s:=soon'), 'max_attitude_gap_s'),
-        (BOTH, lambda f, _: parameters(f, 'observer:=ground'), 'observer: ground needs the site'),
         (BOTH, lambda f, _: parameters(f, 'catalog:=/no/such/file.npz'), '/no/such/file.npz'),
         (
             BOTH,
@@ -396,8 +394,7 @@ def tiny_parameters(change: Callable[[str], str]) -> Callable[[Path, Path], tupl
         ),
         (BOTH, lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
         (BOTH, lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
-        (BOTH, tiny_parameters(lambda text: text + '    psf: {a: [1, b'), 'params.yaml'),
-        (BOTH, tiny_parameters(lambda text: text.replace('camera.yaml', 'no.yaml')), 'no.yaml'),
+        (BOTH, broken_file, 'params.yaml'),
         (PLAYER, lambda *_: (), 'bag: path of the bag to play is missing'),
         (PLAYER, lambda *_: ('-p', 'bag:=/no/such/bag'), '/no/such/bag: no such file or folder'),
         (PLAYER, lambda *_: ('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
@@ -475,3 +472,96 @@ def test_player_loses_nothing(vehicle: Vehicle, tmp_path: Path) -> None:
         np.testing.assert_array_equal(got.pixels, image.pixels)
     stamps = [message_codec.stamp_ns(m.header.stamp) for m in attitudes]
     assert stamps == sorted(stamps)
+
+
+ROOT = Path(__file__).parents[2]
+
+
+def test_a_bag_plays_again_by_its_clock(vehicle: Vehicle) -> None:
+    """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
+    for name in BOTH:
+        ros = ('-r', '__ns:=/cam', '-r', f'__node:={name}', *REMAPS, '--log-level', 'info')
+        vehicle.start(name, 'autostart:=true', 'use_sim_time:=true', ros=ros)
+    vehicle.until(lambda: vehicle.node.count_subscribers('/cam/observations'))
+    status = vehicle.latched(EnsembleStatus, '/cam/ensemble_status')
+    health = vehicle.collect(DiagnosticArray, '/diagnostics')
+    # Simulated time without a /clock yet: diagnostics come all the same, and warn of it.
+    vehicle.until(lambda: len({one.status[0].name for one in health if warns_of_clock(one)}) == 2)
+    vehicle.start_player(vehicle.bag, 'loop:=true', 'clock:=true', ros=('-r', '__ns:=/cam'))
+
+    def restarts() -> int:
+        told = (one.status[0] for one in health if 'star_observer' in one.status[0].name)
+        values = [int(v.value) for s in told for v in s.values if v.key == 'restarts']
+        return max(values, default=0)
+
+    vehicle.until(lambda: restarts() >= 1)
+    images = len(list(reader.read_images([vehicle.bag], IMAGES)))
+    vehicle.until(lambda: status and status[-1].images == images)
+    stamps = [raw.log_time_ns for raw in reader.read_raw([vehicle.bag])]
+
+    def is_within_the_bag() -> bool:
+        return min(stamps) <= stamp_ns(health[-1].header.stamp) <= max(stamps) + 10**9
+
+    vehicle.until(is_within_the_bag)  # whatever pass: the diagnostics take the time from /clock
+
+
+def warns_of_clock(message: DiagnosticArray) -> bool:
+    status = message.status[0]
+    return bool(status.level == b'\x01' and status.message.startswith('no /clock: '))
+
+
+def test_the_policies_name_what_the_nodes_have(vehicle: Vehicle, tmp_path: Path) -> None:
+    """Each security policy allows exactly the topics and services of its node."""
+    with BagWriter(tmp_path / 'bag') as writer:
+        writer.write_image('/image', ImageRecord(1, np.zeros((2, 2), np.uint8)), 'camera')
+        writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')
+        writer.write_velocity('/velocity', 1, np.zeros(3), 'icrf')
+        writer.write_temperature('/temperature', 1, 20.0, 'camera')
+    vehicle.start_player(tmp_path / 'bag', 'clock:=true', 'wait_for_subscribers_s:=100.0')
+    for name in BOTH:
+        # Nobody may listen to the player, or it plays and ends.
+        remaps = ('-r', 'image:=/elsewhere') if name == 'star_observer' else ()
+        vehicle.start(name, ros=remaps)
+    for name in (*BOTH, 'bag_player'):
+        path = ROOT / 'config' / 'security' / f'{name}.policy.xml'
+        profile = ElementTree.parse(path).getroot().find('enclaves/enclave/profiles/profile')
+        assert profile is not None and profile.get('node') == name and profile.get('ns') == '/'
+        allowed = {
+            (kind, full_name(name, str(element.text)))
+            for group in profile
+            for kind in ('publish', 'subscribe', 'reply', 'request')
+            if group.get(kind) == 'ALLOW'
+            for element in group
+        }
+        if importlib.util.find_spec('tf2_msgs') is None:
+            allowed -= {('publish', '/tf_static'), ('subscribe', '/tf_static')}
+        vehicle.until(functools.partial(shows, vehicle, name, allowed))
+        assert of_graph(vehicle, name) == allowed, name
+
+
+def full_name(node: str, name: str) -> str:
+    """Name in a policy, resolved for a node in the root namespace."""
+    if name.startswith('~/'):
+        return f'/{node}/{name[2:]}'
+    return name if name.startswith('/') else f'/{name}'
+
+
+def of_graph(client: Client, name: str) -> set[tuple[str, str]]:
+    """Names of the topics and services of a node, by the policy tags."""
+    node = client.node
+    found = set()
+    for kind, ask in (
+        ('publish', node.get_publisher_names_and_types_by_node),
+        ('subscribe', node.get_subscriber_names_and_types_by_node),
+        ('reply', node.get_service_names_and_types_by_node),
+        ('request', node.get_client_names_and_types_by_node),
+    ):
+        found |= {(kind, topic) for topic, _ in ask(name, '/')}
+    if ('subscribe', '/elsewhere') in found:
+        found = {*found - {('subscribe', '/elsewhere')}, ('subscribe', '/image')}
+    return found
+
+
+def shows(client: Client, name: str, allowed: set[tuple[str, str]]) -> bool:
+    """Return True once the graph shows all names that a node may use."""
+    return name in client.node.get_node_names() and of_graph(client, name) >= allowed

@@ -14,18 +14,15 @@ import subprocess
 import sys
 import time
 
-from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 import psutil  # type: ignore[import-untyped]
 import pytest
-from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from starcal_ground.comparison import map_error_px, parameter_difference
-from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid
+from starcal_ground.comparison import map_error_px
+from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError, TooFewObservations
-from starcal_ros.estimation.calibrate import estimate_calibration
 from studies import __main__ as studies
 from studies import monte_carlo, trials
 from studies.monte_carlo import Design, Row, StudyResult
@@ -214,31 +211,6 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
         assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(40)
 
 
-@pytest.mark.parametrize('method', METHODS)
-@pytest.mark.parametrize('outlier_share', [0.0, 0.1])
-def test_a_prior_far_off_leads_to_the_same_minimum(method: str, outlier_share: float) -> None:
-    """Alignment 0.3 degrees, focal length 20 %, principal point 100 px off; no distortion."""
-    field = trials.draw_star_field(np.random.default_rng(4), 16, 80)
-    ensemble, truth = trials.observe(field, 20.0, outlier_share), field.truth
-    fx, _, fy, cx, cy = truth.camera.parameters[:5]
-    pinhole = {'fx': 1.2 * fx, 'fy': 1.2 * fy, 'cx': cx + 60.0, 'cy': cy - 80.0}
-    camera = truth.camera.replace(**{**dict.fromkeys(PARAMETER_NAMES, 0.0), **pinhole})
-    off = Rotation.from_rotvec(np.radians(0.3) * np.array([0.6, 0.0, 0.8]))
-    options = trials.calibration_options(method, 20.0, estimate=PARAMETER_NAMES)
-    near, far = (
-        estimate_calibration(ensemble, prior, options)
-        for prior in (truth, dataclasses.replace(turned(truth, off), camera=camera))
-    )
-    apart = parameter_difference(far.geometry, near.geometry) / np.sqrt(np.diag(near.covariance))
-    assert np.abs(apart).max() < 0.01
-    wild = (field.outlier_draw < outlier_share).ravel()
-    assert wild.any() == bool(outlier_share)
-    if method != 'single':
-        # Of outliers within 20 px, one in 4000 is within 3.5 sigma of 0.1 px by chance.
-        # `single` takes the star tracker's 20 arcsec for noise of 0.7 px: more stay in.
-        assert int((far.kept & wild).sum()) <= 1
-
-
 def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
     field = trials.draw_star_field(np.random.default_rng(1), 3, 20)
     N = trials.information_blocks(field)
@@ -311,11 +283,9 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
     [
         (['table2'], "invalid choice: 'table2'"),
         (['table1', '--trials', '0'], '--trials: 0 is not within 1 to'),
-        (['table1', '--trials', 'many'], "--trials: invalid int value: 'many'"),
         (['table1', '--seed', '-1'], '--seed: -1'),
         (['table1', '--images', '1'], '--images: 1 is not within 2 to'),
         (['table1', '--stars', '2'], '--stars: 2'),
-        (['table1', '--tracker', '-3'], '-3 is not within 0 to 3600'),
         (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
         (['table1', '--tracker-assumed', '4000'], '4000 is not within'),
         (['table1', '--methods', 'all'], "--methods: invalid choice: 'all'"),

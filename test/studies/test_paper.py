@@ -15,6 +15,7 @@ import pytest
 
 from starcal_ground.simulation import centroids as simulated_centroids
 from starcal_ground.simulation import scenario
+from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.records import Ensemble
 from studies import __main__ as studies
 from studies import monte_carlo, paper
@@ -78,8 +79,15 @@ def test_the_study_shows_what_the_paper_concludes(found: PaperStudy) -> None:
     assert float(rows['per_image']['others_px']) == pytest.approx(found.noise_rms_px, rel=0.02)
     assert float(rows['single']['map_error_px']) > 2 * float(rows['per_image']['map_error_px'])
     gone = [removal.removed for removal in found.removals[1:]]
-    assert {'k3', 'cx', 'cy'} <= set(gone[:4])
-    assert not {'k1', 'fx', 'fy'} & set(gone[:5])
+    assert sorted(gone) == sorted(PARAMETER_NAMES)
+    assert {'cx', 'cy', 'k3'} <= set(gone[:4]) and 'skew' in gone[:6]
+    assert not {'k1', 'fx', 'fy'} & set(gone[:5]) and gone[-1] in ('fx', 'fy', 'k1')
+    # (paper: only 5-6 of the ten matter)
+    residual_px = [removal.residual_rms_px for removal in found.removals]
+    assert residual_px[4] < 1.01 * residual_px[0] and residual_px[-1] > 1.2 * residual_px[0]
+    assert all(later > 0.999 * sooner for sooner, later in itertools.pairwise(residual_px))
+    changes_px = [removal.map_change_px for removal in found.removals]
+    assert changes_px[0] < 1e-6 and changes_px[3] < 0.02 < changes_px[-1]
 
 
 def test_the_page_and_its_figures(found: PaperStudy) -> None:

@@ -4,15 +4,12 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
 from scipy.stats import chi2
 
 from starcal_ground.comparison import map_error_px
-from starcal_ground.simulation.centroids import true_observations
-from starcal_ground.simulation.scenario import scenario
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import estimated_parameters
@@ -123,21 +120,3 @@ def test_terms_that_are_none_are_negligible_and_others_are_not() -> None:
     square = np.mean([terms['k3'].significance ** 2 for terms in said])
     low, high = chi2.ppf([0.001, 0.999], len(said)) / len(said)
     assert low < square < high
-
-
-def test_terms_that_matter_stay_to_the_last() -> None:
-    """On a night like the paper's: principal point, skew and k3 first, k1 or fx last."""
-    seed = int(np.random.default_rng(6).integers(2**31))
-    night = dataclasses.replace(scenario('paper', seed), image_count=15, cadence_s=250.0)
-    options = trials.calibration_options('per_image', 20.0, estimate=PARAMETER_NAMES)
-    removals = removal_study(estimate_calibration(true_observations(night), night.prior, options))
-    assert sorted(removal.removed for removal in removals) == sorted(['', *PARAMETER_NAMES])
-    assert {removal.removed for removal in removals[1:5]} == {'cx', 'cy', 'k3', 'skew'}
-    assert removals[-1].removed in ('fx', 'fy', 'k1')
-    # (paper: only 5-6 of the ten matter)
-    residual = [removal.residual_rms_px for removal in removals]
-    assert residual[4] < 1.01 * residual[0]
-    assert residual[-1] > 1.2 * residual[0]
-    assert all(later > 0.999 * sooner for sooner, later in itertools.pairwise(residual))
-    changes = [removal.map_change_px for removal in removals]
-    assert changes[0] < 1e-6 and changes[3] < 0.02 < changes[-1]

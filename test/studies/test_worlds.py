@@ -3,13 +3,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bench.evidence import simulated
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID
@@ -116,14 +113,6 @@ def test_a_drawn_mission_is_within_the_priors_that_the_documents_promise(mission
     assert np.isfinite(made.true_directions[0]).all()
     if all(len(image) > 30 for image in made.ensemble.images) and not sound.velocity_m_s:
         assert 0.75 < chi2_per_number(made) < 1.25
-
-
-@pytest.mark.slow
-def test_a_sound_world_is_honest_and_near_its_bound() -> None:
-    stated = dataclasses.replace(worlds.WORLDS['plain'], shutter='global')
-    scores = [simulated(stated, seed) for seed in (1, 2, 3)]
-    assert 0.5 < np.sqrt(np.mean([s.shape**2 for s in scores])) < 1.6
-    assert all(0.9 < s.sigma_arcsec / s.bound_arcsec < 1.6 for s in scores)
 
 
 @pytest.mark.parametrize('samples', [0, 2])

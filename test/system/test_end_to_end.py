@@ -3,10 +3,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import importlib.util
-import io
 import json
 from pathlib import Path
 import signal
@@ -22,7 +20,6 @@ import yaml
 
 from starcal_ground.bags.frames import read_telemetry
 from starcal_ground.bags.reader import read_images, Topics
-from starcal_ground.cli import main
 from starcal_ground.comparison import alignment_difference_rad, compare, truth_like
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
@@ -49,22 +46,6 @@ def in_a_process(*arguments: object) -> subprocess.CompletedProcess[str]:
     """Run the tool as a user does, with its log in the standard error stream."""
     command = [sys.executable, '-m', 'starcal_ground.cli.main', *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, check=False)
-
-
-def starcal(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the tool in this process."""
-    out, err = io.StringIO(), io.StringIO()
-    given = [str(argument) for argument in arguments]
-    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
-        status = main.main(given)
-    return subprocess.CompletedProcess(given, status, out.getvalue(), err.getvalue())
-
-
-def calibrated(made: simulated_bag.SimulatedBag, folder: Path) -> Calibration:
-    """Calibration of a bag in this process, where warnings are errors."""
-    arguments = ['calibrate', str(made.bag), '--params', str(made.params), '-o', str(folder)]
-    assert main.main(arguments) == 0
-    return read_calibration(folder / 'calibration.json')
 
 
 def read_truth(path: Path) -> CameraGeometry:
@@ -108,10 +89,10 @@ def test_camera_info_is_the_calibration_without_skew(tiny_products) -> None:
     assert worst_px == pytest.approx(calibration.zero_skew_cost_px, rel=1e-6)
 
 
-def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path) -> None:
+def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path, starcal) -> None:
     bag = tiny_products / 'observations.mcap'
     done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     first, second = (
         json.loads((folder / 'calibration.json').read_text())
         for folder in (tiny_products, tmp_path)
@@ -120,13 +101,12 @@ def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path
     assert first == second
 
 
-def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path) -> None:
+def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path, starcal) -> None:
     of_nodes = {'autostart': True, 'attitude_timeout_s': 2.0, 'use_sim_time': True}
     params = params_with(tmp_path, max_change_px=1e-6, **of_nodes)
     done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
-    assert done.returncode == 3
-    assert done.stderr == ''
-    assert 'max_change_px' in done.stdout
+    assert (done.status, done.err) == (3, '')
+    assert 'max_change_px' in done.out
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert not calibration.accepted
     assert 'max_change_px' in calibration.reasons[0]
@@ -177,10 +157,12 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
             assert abs(row - 5) <= 2 and abs(column - 5) <= 2
 
 
-def test_a_zenith_campaign_gives_the_truth(tmp_path) -> None:
+def test_a_zenith_campaign_gives_the_truth(tmp_path, starcal) -> None:
     scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
     made = simulated_bag.write_bag(scenario, tmp_path / 'bag.mcap')
-    calibration = calibrated(made, tmp_path / 'out')
+    out = tmp_path / 'out'
+    assert starcal('calibrate', made.bag, '--params', made.params, '-o', out).status == 0
+    calibration = read_calibration(out / 'calibration.json')
     assert_close_to_truth(calibration, read_truth(made.truth))
 
 
@@ -225,7 +207,7 @@ def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path) -> None:
 
 
 @pytest.mark.skipif(not INDEPENDENT.is_dir(), reason='the independent bag is not here')
-def test_a_bag_of_another_simulator_gives_the_truth(tmp_path) -> None:
+def test_a_bag_of_another_simulator_gives_the_truth(tmp_path, starcal) -> None:
     truth = json.loads((INDEPENDENT / 'small_101.json').read_text())
     k, d = truth['k_prior'], truth['d_prior']
     K = [k[0], k[1], k[3], 0.0, k[2], k[4], 0.0, 0.0, 1.0]
@@ -246,19 +228,19 @@ def test_a_bag_of_another_simulator_gives_the_truth(tmp_path) -> None:
     params.write_text(yaml.safe_dump({'/**': {'ros__parameters': values}}))
     bag = INDEPENDENT / truth['bag']
     done = starcal('calibrate', bag, '--params', params, '-o', tmp_path / 'out')
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert_close_to_truth(calibration, simulated_bag.true_geometry(truth))
 
 
 @pytest.mark.skipif(not REAL_SKY.is_dir(), reason='the bag of the real sky is not here')
-def test_a_real_sky_calibrates_and_its_wrong_attitudes_are_refused(tmp_path) -> None:
+def test_a_real_sky_calibrates_and_its_wrong_attitudes_are_refused(tmp_path, starcal) -> None:
     params = ROOT / 'config' / 'examples' / 'realsky.yaml'
     done = starcal(
         'calibrate', REAL_SKY, '--params', params, '-o', tmp_path,
         '--image-topic', '/opnav/image_raw', '--attitude-topic', '/star_tracker/attitude',
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
+    assert done.status == 0, done.err
     calibration = read_calibration(tmp_path / 'calibration.json')
     assert calibration.images_used == 9
     assert dict(calibration.images_refused) == {'no_match': 2}

@@ -1,5 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Each module imports alone, and start-up imports stay small; see also `make lint`."""
+"""
+`starcal_ros` is what the nodes import, each module imports alone, and start-up imports stay small.
+
+See also `make lint`.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,8 @@ import subprocess
 import sys
 
 import pytest
+
+import starcal_ros
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ('starcal_ros', 'starcal_ground')
@@ -25,20 +31,39 @@ WITHOUT_ROS = [
     name for name in MODULES
     if '.ros.' not in name or name.endswith(('.ros.archive', '.ros.image_queue', '.ros.state'))
 ]  # fmt: skip
-BLOCKS = ('body', 'orelse', 'handlers', 'finalbody')  # of an if, a try, a class
+BLOCKS = ('body', 'orelse', 'handlers', 'finalbody', 'cases')  # of an if, a try, a class
+NODES = ('starcal_ros.ros.star_observer', 'starcal_ros.ros.calibrator')
+# FITS of dark and flat frames are read by Astropy where it is installed.
+STAYS_ON_THE_GROUND = {
+    *('PIL', 'argcomplete', 'dask', 'fsspec', 'jinja2', 'rich', 'rosbag2_py', 'spiceypy'),
+    'starcal_ground',
+}
 
 
-def run_at_import(statements: list[ast.stmt]) -> Iterator[ast.Import | ast.ImportFrom]:
-    """Import statements of a module that its import runs: none of functions or for types alone."""
+def import_statements(
+    statements: list[ast.stmt], in_functions: bool
+) -> Iterator[ast.Import | ast.ImportFrom]:
+    """Import statements that run: none for types alone, and those of functions if asked for."""
     for one in statements:
+        is_function = isinstance(one, (ast.FunctionDef, ast.AsyncFunctionDef))
         if isinstance(one, (ast.Import, ast.ImportFrom)):
             yield one
-        elif isinstance(one, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            continue
         elif isinstance(one, ast.If) and 'TYPE_CHECKING' in ast.unparse(one.test):
-            yield from run_at_import(one.orelse)
-        else:
-            yield from run_at_import([part for name in BLOCKS for part in getattr(one, name, [])])
+            yield from import_statements(one.orelse, in_functions)
+        elif in_functions or not is_function:
+            inner = [part for name in BLOCKS for part in getattr(one, name, [])]
+            yield from import_statements(inner, in_functions)
+
+
+def imported_by(name: str, in_functions: bool = True) -> set[str]:
+    """Every name that a module imports: of modules, and of what is taken from them."""
+    found: set[str] = set()
+    for one in import_statements(ast.parse(MODULES[name].read_text()).body, in_functions):
+        names = {alias.name for alias in one.names}
+        if isinstance(one, ast.ImportFrom):
+            names = {str(one.module), *(f'{one.module}.{each}' for each in names)}
+        found |= names
+    return found
 
 
 def needed_by(name: str) -> set[str]:
@@ -48,16 +73,36 @@ def needed_by(name: str) -> set[str]:
     The packages of an imported module are run before it, but those that the importing module is
     in are running already.
     """
-    found = set()
-    for one in run_at_import(ast.parse(MODULES[name].read_text()).body):
-        names = [alias.name for alias in one.names]
-        if isinstance(one, ast.ImportFrom):
-            names = [str(one.module), *(f'{one.module}.{each}' for each in names)]
-        for imported in names:
-            parts = imported.split('.')
-            outer = {'.'.join(parts[:k]) for k in range(1, len(parts))}
-            found |= {imported} | {each for each in outer if not f'{name}.'.startswith(f'{each}.')}
+    found = imported_by(name, in_functions=False)
+    for parts in [imported.split('.') for imported in found]:
+        outer = {'.'.join(parts[:k]) for k in range(1, len(parts))}
+        found |= {each for each in outer if not f'{name}.'.startswith(f'{each}.')}
     return found & MODULES.keys()
+
+
+def closure(starts: tuple[str, ...]) -> dict[str, set[str]]:
+    """What each module imports of those that the first ones reach, their packages included."""
+    reached: dict[str, set[str]] = {}
+    waiting = list(starts)
+    while waiting:
+        name = waiting.pop()
+        if name in MODULES and name not in reached:
+            reached[name] = imported_by(name)
+            waiting += [*reached[name], name.rpartition('.')[0]]
+    return reached
+
+
+def test_all_of_starcal_ros_flies() -> None:
+    """The nodes import it, or a consumer of calibrations on the vehicle does."""
+    flies = closure(NODES).keys() | {'starcal_ros.entry_points'}
+    assert {name for name in MODULES if name.startswith('starcal_ros')} - flies == set()
+    consumed = [name for name in starcal_ros.__all__ if name != '__version__']
+    assert {getattr(starcal_ros, name).__module__ for name in consumed} <= flies
+
+
+def test_what_flies_needs_nothing_of_the_ground() -> None:
+    tops = {name.partition('.')[0] for names in closure(NODES).values() for name in names}
+    assert 'numpy' in tops and not tops & STAYS_ON_THE_GROUND
 
 
 def test_each_module_imports_alone() -> None:

@@ -193,6 +193,7 @@ def are_tests(span: str) -> bool:
     return len(found) == len(files) and any(name in test for tests in found for test in tests)
 
 
+@pytest.mark.slow
 def test_what_a_docstring_names_exists() -> None:
     strange = []
     for path in OF_PACKAGES:

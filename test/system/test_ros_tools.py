@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The nodes and launch files with the real ROS 2 tools, on Fast DDS and on Cyclone DDS.
-
-Run with ``-s``, most tests print a row of the table in docs/reliability.md.
-"""
+"""The nodes and launch files with the real ROS 2 tools, on Fast DDS and on Cyclone DDS."""
 
 from __future__ import annotations
 
@@ -18,8 +14,8 @@ import subprocess
 import sys
 from typing import Any
 
+from mission_files import params_with  # type: ignore[import-not-found]
 import pytest
-import yaml
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -76,17 +72,9 @@ def ros2(make: Make, request: pytest.FixtureRequest) -> RosTools:
     return make(request.param)
 
 
-def row(rmw: str, tool: str, command: str, outcome: str) -> None:
-    print(f'\n| {tool}, {"Fast" if rmw == FAST else "Cyclone"} DDS | `{command}` | {outcome} |')
-
-
 def has_rosbag2(ros2: RosTools) -> bool:
     """Return True if the libraries of rosbag2 load; its commands are missing otherwise."""
     return ' record ' in ros2.run('bag', '--help').stdout
-
-
-def middleware(ros2: RosTools) -> str:
-    return str(ros2.environment['RMW_IMPLEMENTATION'])
 
 
 def test_launch_replay_calibrate_and_record(ros2, tiny_bag, tmp_path) -> None:
@@ -115,43 +103,35 @@ def test_launch_replay_calibrate_and_record(ros2, tiny_bag, tmp_path) -> None:
     static = ros2.run('topic', 'echo', '--once', '/tf_static', 'tf2_msgs/msg/TFMessage')
     assert 'child_frame_id: camera' in static.stdout, static.stderr
     record.until_said("Subscribed to topic '/opnav/calibration'")
-    row(middleware(ros2), 'launch, rosbag2', 'ros2 launch starcal starcal.launch.py', '10 images')
     assert record.interrupt() == 0, record.said()
     counts = {topic.name: topic.count for topic in reader.topics([recorded])}
     assert counts == {'/opnav/observations': 10, '/opnav/calibration': 1, '/tf_static': 1}
     launch.interrupt()
     assert launch.said().count('process has finished cleanly') == 2, launch.said()
-    row(middleware(ros2), 'rosbag2', 'ros2 bag record', 'calibration and observations read back')
 
 
 def test_launch_arguments_are_shown(make) -> None:
     for file in ('starcal.launch.py', 'replay.launch.py'):
         shown = make(FAST).run('launch', 'starcal', file, '--show-args')
         assert shown.returncode == 0 and "'params_file':" in shown.stdout, shown.stderr
-    row(FAST, 'launch', 'ros2 launch starcal replay.launch.py --show-args', 'every argument')
 
 
 def test_replay_launch(make, tiny_bag, tmp_path) -> None:
     ros2 = make(FAST)
-    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
-    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
-    remapped = tmp_path / 'images.yaml'
-    remapped.write_text(yaml.safe_dump(values))
+    params = params_with(tmp_path, state_dir=str(tmp_path / 'state'))
     launch = ros2.start(
-        *('launch', 'starcal', 'replay.launch.py', f'params:={remapped}', f'bag:={tiny_bag}'),
+        *('launch', 'starcal', 'replay.launch.py', f'params:={params}', f'bag:={tiny_bag}'),
         *('rate:=0.0', 'loop:=false', 'image:=/opnav/image_raw'),
         'attitude:=/star_tracker/attitude',
     )
     ros2.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
     launch.interrupt()
     assert 'process has died' not in launch.said(), launch.said()
-    row(FAST, 'launch', 'ros2 launch starcal replay.launch.py', '10 images')
     if not has_rosbag2(ros2):
         return
     info = ros2.run('bag', 'info', tmp_path / 'state' / 'ensemble' / '00000001.mcap')
     words = info.stdout.split()
     assert words[words.index('Messages:') + 1] == '1', info.stdout + info.stderr
-    row(FAST, 'rosbag2', 'ros2 bag info STATE_DIR/ensemble/00000001.mcap', '1 message')
 
 
 @pytest.mark.parametrize(
@@ -163,10 +143,7 @@ def test_a_wrong_launch_argument_leaves_no_process(
 ) -> None:
     """The launch ends by itself, and the nodes with it: another calibrator can have the folder."""
     ros2 = make(FAST)
-    values = yaml.safe_load((tiny_bag / 'params.yaml').read_text())
-    values['/**']['ros__parameters']['state_dir'] = str(tmp_path / 'state')
-    params = tmp_path / 'params.yaml'
-    params.write_text(yaml.safe_dump(values))
+    params = params_with(tmp_path, state_dir=str(tmp_path / 'state'))
     files = (f'params_file:={params}', f'bag:={tiny_bag}')
     launch = ros2.start('launch', 'starcal', 'replay.launch.py', *files, argument)
     launch.wait()
@@ -207,7 +184,6 @@ def test_two_cameras_with_one_frame_are_named(
     for name in ('left', 'right'):
         client.until(lambda name=name: message(name).startswith(says))
     client.until(lambda: message('third') == 'calibration active')
-    row(FAST, 'tf2_msgs', 'two calibrators with one `camera_frame`', 'both name it')
 
 
 def test_lifecycle_and_parameters(ros2, tiny_bag, tmp_path) -> None:
@@ -235,7 +211,6 @@ def test_lifecycle_and_parameters(ros2, tiny_bag, tmp_path) -> None:
         if state == 'inactive':
             answer = ros2.run('service', 'call', '/calibrator/calibrate', TRIGGER)
             assert "message='not active: inactive'" in answer.stdout, answer.stderr
-    row(middleware(ros2), 'ros2cli', 'ros2 lifecycle set /calibrator ...', 'all four transitions')
     changed = ros2.run('param', 'set', '/calibrator', 'min_images', '5')
     assert 'successful' in changed.stdout, changed.stderr
     refused = ros2.run('param', 'set', '/calibrator', 'star_tracker_sigma_arcsec', '[-1.0, 2.0]')
@@ -247,7 +222,6 @@ def test_lifecycle_and_parameters(ros2, tiny_bag, tmp_path) -> None:
     again = ros2.start_node('calibrator', '--params-file', dump)
     ros2.until('Integer value is: 5', 'param', 'get', '/calibrator', 'min_images')
     assert 'not a parameter' not in again.said()
-    row(middleware(ros2), 'ros2cli', 'ros2 param set, get, dump', 'a dump starts a node again')
 
 
 OPERATOR = """<?xml version="1.0" encoding="UTF-8"?>
@@ -301,18 +275,15 @@ def test_policies_are_enforced(make, tiny_bag, tmp_path) -> None:
     operator.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
     answer = operator.run('service', 'call', '/calibrator/calibrate', TRIGGER)
     assert 'success=True' in answer.stdout, answer.stdout + calibrator.said()
-    row(CYCLONE, 'sros2', 'ros2 security create_permission', 'nodes work under enforcement')
 
     listed = done(outsider.run('node', 'list', '--no-daemon', '--spin-time', '5'))
     assert 'calibrator' not in listed and 'star_observer' not in listed
     with pytest.raises(subprocess.TimeoutExpired):
         outsider.run('service', 'call', '/calibrator/reset', TRIGGER, timeout_s=15.0)
     assert 'images: 10\n' in done(operator.run(*ECHO, '/ensemble_status', STATUS))
-    row(CYCLONE, 'sros2', 'ros2 node list, service call from outside', 'sees and calls nothing')
 
     denied = nodes.start_node('calibrator', '--enclave', '/bag_player', *params)
     assert denied.wait() != 0, denied.said()
-    row(CYCLONE, 'sros2', 'calibrator in the enclave of bag_player', 'denied')
 
 
 SECURITY = ROOT / 'config' / 'security'

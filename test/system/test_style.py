@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Rules of CONTRIBUTING.md that ruff and mypy do not check."""
+"""Rules of CONTRIBUTING.md that ruff and mypy do not check; which tests `make check` runs."""
 
 from __future__ import annotations
 
@@ -7,6 +7,10 @@ import ast
 from pathlib import Path
 import re
 from xml.etree import ElementTree
+
+import pytest
+
+from tools.tests_of_change import nearest_tests
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ('starcal_ros', 'starcal_ground', 'studies')
@@ -23,7 +27,7 @@ LICENCE = '# Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache
 # Without its docstring; no longer than the longest of today: a new one must earn more.
 LONGEST_FUNCTION_LINES = 77
 SUBJECTS = {  # tests of several modules together
-    *('awkward_frames', 'diagnostics', 'faults', 'icd_client', 'kills', 'lens_models', 'motion'),
+    *('awkward_frames', 'diagnostics', 'icd_client', 'kills', 'lens_models', 'motion'),
     *('nodes', 'object_store', 'onboard_alone', 'set_up_mistakes', 'star_trackers', 'trend'),
     'worlds',
 }
@@ -81,3 +85,32 @@ def test_each_file_names_the_holder_and_the_licence_of_the_package() -> None:
     ]
     assert len(EVERY_FILE) > 200
     assert not lacking, f'put {LICENCE!r} on the first line of {lacking}'
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('changed', 'nearest'),
+    [
+        ('starcal_ros/estimation/weights.py', 'test/onboard/estimation/test_weights.py'),
+        ('starcal_ros/errors.py', 'test/onboard/test_errors.py'),  # imported by 69 test files
+        # Imported by no test, but by the package that the tests import.
+        ('starcal_ros/records/calibration.py', 'test/onboard/records/test_observations.py'),
+        (
+            'starcal_ground/cli/commands/plan.py',
+            'test/ground/cli/commands/test_plan.py',
+        ),  # loaded by name
+        ('test/flight.py', 'test/nodes/test_hostile_messages.py'),  # a helper of tests
+        ('test/onboard/test_text.py', 'test/onboard/test_text.py'),
+    ],
+)
+def test_the_tests_of_a_changed_file_are_few_and_about_it(changed, nearest, monkeypatch):
+    monkeypatch.chdir(ROOT)
+    tests = nearest_tests([Path(changed)])
+    assert Path(nearest) in tests
+    assert len(tests) < 20, tests  # of more than 200 files
+
+
+@pytest.mark.slow
+def test_documents_and_files_that_are_gone_have_no_tests(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    assert nearest_tests([Path('README.md'), Path('test/test_gone.py')]) == []

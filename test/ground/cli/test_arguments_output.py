@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 import hashlib
-import os
 from pathlib import Path
 import random
 import shutil
@@ -18,7 +17,7 @@ import signal
 import subprocess
 import sys
 
-from attacks import BAG, digests, many  # type: ignore[import-not-found]
+from attacks import BAG, digests, many, NO_FILES  # type: ignore[import-not-found]
 import pytest
 
 from starcal_ground.cli import main
@@ -187,9 +186,7 @@ def _edited(path: Path) -> None:
 OF_OTHERS: dict[str, Callable[[Path], object]] = {
     'foreign': _foreign,
     'edited': _edited,
-    'folder': Path.mkdir,
-    'dangling link': lambda path: path.symlink_to('nothing'),
-    'pipe': os.mkfifo,
+    **{kind: NO_FILES[kind] for kind in ('folder', 'dangling link', 'pipe')},
 }
 
 

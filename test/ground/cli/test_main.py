@@ -15,20 +15,18 @@ import signal
 import subprocess
 import sys
 
-from mission_files import params_with, TINY  # type: ignore[import-not-found]
+from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
-from starcal_ground.bag_writer import BagWriter
 from starcal_ground.child_process import module_command
 from starcal_ground.cli import main, node_processes
-from starcal_ground.cli.arguments import EXIT_INTERRUPTED
+from starcal_ground.cli.arguments import EXIT_INTERRUPTED, parse_time, Selection
 from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import COMMANDS, parser
 from starcal_ros.constants import software_version
 from starcal_ros.formats.products.product_files import write_atomically
-from starcal_ros.records import Image
 
 
 def test_no_command_prints_the_help(starcal) -> None:
@@ -41,17 +39,12 @@ def test_version(starcal) -> None:
     assert starcal('--version') == (0, f'starcal {software_version()}\n', '')
 
 
-@pytest.fixture(scope='module')
-def lookup_columns() -> list[str]:
-    """Columns of a table of lines of sight, as the interface document has them."""
+def test_lookup_writes_the_columns_of_the_interface_document(
+    starcal, tmp_path, tiny_products
+) -> None:
     text = (Path(__file__).parents[3] / 'docs' / 'commands.md').read_text()
     (row,) = (line for line in text.splitlines() if line.startswith('| `starcal lookup '))
-    return re.findall(r'`(\w+)`', row.split('|', 2)[2])
-
-
-def test_lookup_writes_the_columns_of_the_interface_document(
-    starcal, tmp_path, tiny_products, lookup_columns
-) -> None:
+    lookup_columns = re.findall(r'`(\w+)`', row.split('|', 2)[2])
     file = tmp_path / 'table.csv'
     status, out, err = starcal('lookup', tiny_products, '-o', file)
     assert (status, err) == (0, '')
@@ -71,26 +64,6 @@ def test_lookup_writes_the_columns_of_the_interface_document(
         assert list(archive.files) == lookup_columns
         assert sorted(set(archive['u_px'])) == [0, 319.5, 639]
         assert sorted(set(archive['v_px'])) == [0, 255.5, 511]
-
-
-BLANK = np.full((512, 640), 33, np.uint16)
-
-
-def test_a_temperature_topic_must_be_there(starcal, tmp_path) -> None:
-    files = ('--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
-    result = starcal('calibrate', TINY, *files, '--temperature-topic', '/box')
-    assert_refused(result, '/box', 'sensor_msgs/msg/Temperature')
-    two = tmp_path / 'two.mcap'
-    with BagWriter(two) as writer:
-        writer.write_image('/image', Image(5, BLANK), 'camera')
-        writer.write_attitude('/att', 5, np.array([0.0, 0.0, 0.0, 1.0]), 'icrf')
-        for topic in ('/lens', '/box'):
-            writer.write_temperature(topic, 5, 20.0, 'camera')
-    # Two thermometers: which one, is asked only where it matters.
-    assert_refused(starcal('calibrate', two, *files), 'No image of 1 can be used', 'as blank')
-    asks = params_with(tmp_path, focal_temperature_order=1)
-    result = starcal('calibrate', two, '--params', asks, '-o', tmp_path / 'out')
-    assert_refused(result, 'several topics of type sensor_msgs/msg/Temperature', '/box, /lens')
 
 
 def examples() -> list[tuple[str, list[str]]]:
@@ -301,3 +274,18 @@ def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
         start()
     assert seen
     assert signal.getsignal(signal.SIGTERM) is before
+
+
+STAMPS_NS = [(1_778_829_600 + 10 * k) * 1_000_000_000 for k in range(12)]
+
+
+def chosen(start: str | None, end: str | None) -> list[int]:
+    after, before = (None if text is None else parse_time(text) for text in (start, end))
+    wanted = Selection(after, before)
+    return [k for k, stamp in enumerate(STAMPS_NS) if wanted(stamp)]
+
+
+def test_between_two_times() -> None:
+    assert chosen('+20', '+50') == [2, 3, 4, 5]
+    assert chosen('1778829680', None) == [8, 9, 10, 11]
+    assert chosen('2026-05-15T07:20:20', '2026-05-15T07:20:40Z') == [2, 3, 4]

@@ -9,16 +9,12 @@ from pathlib import Path
 import resource
 import shutil
 
+from attacks import NO_FILES  # type: ignore[import-not-found]
 import pytest
 from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
 pytestmark = pytest.mark.usefixtures('forked_readers')
 _MOST_BYTES = 1 << 30  # that a file adds to the memory
-
-
-def _sparse(path: Path) -> None:
-    with path.open('wb') as file:
-        file.truncate(20 << 30)
 
 
 def _unreadable(path: Path) -> None:
@@ -28,11 +24,7 @@ def _unreadable(path: Path) -> None:
 
 
 KINDS: dict[str, Callable[[Path], object]] = {
-    'pipe': os.mkfifo,
-    'device': lambda path: path.symlink_to('/dev/zero'),
-    'sparse': _sparse,
-    'dangling link': lambda path: path.symlink_to('nothing'),
-    'folder': Path.mkdir,
+    **NO_FILES,
     'unreadable': _unreadable,
     'empty': Path.touch,
     'garbage': lambda path: path.write_bytes(bytes(range(256)) * 64),

@@ -14,7 +14,7 @@ import sys
 from typing import Any
 
 import pytest
-from trend_missions import write  # type: ignore[import-not-found]
+from trend_rows import write  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.cli.main import main

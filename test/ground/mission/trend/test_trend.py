@@ -17,7 +17,7 @@ import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
-from trend_missions import make_mission, write  # type: ignore[import-not-found]
+from trend_rows import make_mission, write  # type: ignore[import-not-found]
 
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras, Task
