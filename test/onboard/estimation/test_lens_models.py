@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 
-from geometries import turned  # type: ignore[import-not-found]
+from geometries import COEFFICIENTS, turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -27,16 +27,6 @@ from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.records import CameraGeometry, Ensemble
 
-#           k1   k2    k3    p1     p2     k4    k5   k6
-RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]
-PRISM = [2e-3, -1e-3, -1.5e-3, 5e-4]
-LENSES = {
-    'plumb_bob': [-0.2, 0.08, -0.01, 1e-3, -7e-4],
-    'rational_polynomial': RATIONAL,
-    'thin_prism': [*RATIONAL, *PRISM],
-    'tilted': [*RATIONAL, *PRISM, 0.02, -0.03],
-    'equidistant': [-0.02, 0.01, -0.004, 5e-4],
-}
 # Tens of degrees: in a narrow field the terms of these models cannot be told apart.
 FOCAL_PX = 420.0
 # On a field of 66 degrees the higher terms of the large models still trade with each other: they
@@ -55,7 +45,7 @@ def wide(model: str, seed: int = 3) -> Scenario:
     """The tiny scenario with a wide lens of a model, and a prior that is off."""
     tiny = scenario('tiny', seed=seed)
     camera = tiny.truth.camera
-    parameters = np.r_[FOCAL_PX, 0.3, FOCAL_PX + 1.0, camera.parameters[3:5], LENSES[model]]
+    parameters = np.r_[FOCAL_PX, 0.3, FOCAL_PX + 1.0, camera.parameters[3:5], COEFFICIENTS[model]]
     truth = dataclasses.replace(
         tiny.truth, camera=CameraModel(camera.width, camera.height, parameters, model)
     )
@@ -142,7 +132,7 @@ def test_a_lens_model_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None
         ("(x', y') = (x, y) / (1 + k1 r2)",),
     )
     monkeypatch.setitem(lens.LENSES, 'division', row)
-    monkeypatch.setitem(LENSES, 'division', [0.08])
+    monkeypatch.setitem(COEFFICIENTS, 'division', [0.08])
     monkeypatch.setitem(ESTIMATE, 'division', ('fx', 'skew', 'fy', 'distortion'))
     made = wide('division')
     found = estimate_of(made, 'division', true_observations(made))
