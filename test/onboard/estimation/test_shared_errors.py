@@ -14,7 +14,6 @@ from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.amplitudes import LARGEST_FIELD_PX, log_amplitudes
 from starcal_ros.estimation.shared_errors import (
     chain_means,
-    group_sums,
     observation_groups,
     pair_moment,
     pairs_of,
@@ -324,46 +323,3 @@ def test_two_stars_in_the_same_cell_again_and_again_are_one_pair() -> None:
     assert len(ratios) == 60
     assert np.count_nonzero(np.array(ratios) > 5.41) <= 2  # 1 %, one-sided, and one by chance
     assert max(ratios) < 16.0
-
-
-def test_sums_over_groups_are_those_of_all_pairs() -> None:
-    rng = np.random.default_rng(6)
-    n, r = 40, 3
-    Y = rng.normal(size=(n, 2, r))
-    from_sky = random_rolls(rng, n)
-    star, cell = rng.integers(0, 25, n), rng.integers(-1, 5, n)  # in no cell: not used
-    used = np.flatnonzero(cell >= 0)
-    star[cell < 0] = -1
-    of_place = rng.uniform(0.2, 0.4, n)
-    errors = (
-        SharedError('star places', star, of_place, 0.0, True, 1.0),
-        SharedError('cells', cell, np.full(n, 0.05), 0.0, False, 1.0),
-        SharedError('nothing', cell, np.full(n, 0.4), 0.0, False, 0.009),
-    )
-    variance = rng.uniform(0.1, 0.6, n)
-    sizes = {-1: 0, **{k: int((star == k).sum()) for k in range(25)}}
-    assert min(sizes[k] for k in star[used]) == 1 < max(sizes.values())
-    total = 0.05 + of_place * np.array([sizes[k] > 1 for k in star])
-    # Bright stars share no more than their own variance.
-    share = np.minimum(variance / total, 1.0)
-    assert (share[used] < 1.0).any() and (share[used] == 1.0).any()
-    inflation = rng.uniform(0.0, 0.2, n)
-    of_stars, of_cells, own = np.zeros((3, r, r))
-    for i in used:
-        own += (share[i] * total[i] + inflation[i]) * Y[i].T @ Y[i]
-        for j in used:
-            common = math.sqrt(share[i] * share[j])
-            if star[i] == star[j] and sizes[star[i]] > 1:
-                place = common * math.sqrt(of_place[i] * of_place[j])
-                of_stars += place * Y[i].T @ from_sky[i] @ from_sky[j].T @ Y[j]
-            if cell[i] == cell[j]:
-                of_cells += 0.05 * common * Y[i].T @ Y[j]
-    parts = [
-        (part, Y[part].transpose(1, 0, 2)) for part in np.array_split(rng.permutation(used), 3)
-    ]
-    whole, alone = group_sums(errors, variance, inflation, from_sky, parts, r)
-    assert list(whole) == ['star places', 'cells']
-    assert whole['star places'] == pytest.approx(of_stars, abs=1e-10)
-    assert whole['cells'] == pytest.approx(of_cells, abs=1e-10)
-    assert alone == pytest.approx(own, abs=1e-10)
-    assert group_sums((), variance, inflation, from_sky, parts, r)[0] == {}
