@@ -200,21 +200,6 @@ def test_each_error_has_its_likelihood_ratio_and_its_effect() -> None:
     assert min(ratios) < 0.0 < max(ratios) < 3.0
 
 
-def test_cells_are_a_sixth_of_a_wave() -> None:
-    n = 200
-    rng = np.random.default_rng(5)
-    pixels = rng.uniform(0.0, 1199.0, (n, 2))
-    last = np.zeros(1), np.ones(1)
-    found = errors_of(rng.normal(size=(n, 2)), np.ones(n), pixels, np.arange(n), last)
-    for error, wave in zip(found[1:], (1 / 4, 1 / 8, 1 / 16), strict=True):
-        keys = pixels.T // (WIDTH * wave / 6)
-        same = np.equal.outer(error.group, error.group)
-        expected = (keys[:, :, None] == keys[:, None, :]).all(axis=0)
-        # Half a pixel: the first pixel begins at -0.5.
-        assert (same != expected).mean() < 0.02
-        assert same[expected].mean() > 0.5
-
-
 @pytest.mark.parametrize(
     ('planted', 'name'),
     [

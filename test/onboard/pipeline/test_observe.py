@@ -15,12 +15,8 @@ from sample_sky import errors_sigma  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 from tiny_campaign import attitudes, image, SCENARIO, TRUTH, values, write_png  # type: ignore[import-not-found]
 
-from starcal_ground.bags import topics
-from starcal_ground.bags.frames import read_telemetry
-from starcal_ground.bags.reader import read_images, Topics
 from starcal_ground.simulation.rendering import render, star_electrons
 from starcal_ground.simulation.scenario import attitude_samples, Inertial, scene
-from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
 from starcal_ros.camera import project
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.bag.typestore import make_message
@@ -35,7 +31,6 @@ from starcal_ros.sky.astrometry import air_above, apparent_directions, through_t
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory, attitudes_at, Mounting
 
 S = 1_000_000_000
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
 
 
 @pytest.fixture(scope='module')
@@ -253,26 +248,6 @@ def test_a_star_tracker_that_jumped_and_came_back(setup: Setup, jump_deg: float)
     # What the first image found of the turned alignment has carried to the last.
     # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
     assert turn_between(TRUTH, track.geometry).magnitude() < 200 * ARCSECOND_RAD
-
-
-@pytest.mark.slow
-def test_a_bag_read_once_gives_what_two_passes_give(camera_yaml: Path) -> None:
-    """The tiny bag, all telemetry read before the first image, to the last bit."""
-    setup = load_setup(values(camera_yaml))
-    found = list(topics.read([TINY], Topics(IMAGE_TOPIC, ATTITUDE_TOPIC), setup))
-    held = read_telemetry([TINY], Topics('', ATTITUDE_TOPIC), setup.attitude).attitudes
-    track, expected = observe.Track(setup.prior), []
-    for one in read_images([TINY], IMAGE_TOPIC):
-        assert isinstance(one, Image)
-        observations, track = observe.observe_next(one, held, setup, track)
-        expected.append(observations)
-    assert len(found) == 10
-    for one_pass, two_passes in zip(found, expected, strict=True):
-        assert not one_pass.refusal
-        for field in dataclasses.fields(StarObservations):
-            np.testing.assert_array_equal(
-                getattr(one_pass, field.name), getattr(two_passes, field.name), field.name
-            )
 
 
 def test_a_dark_frame_takes_a_pattern_away(camera_yaml: Path, tmp_path: Path) -> None:
