@@ -454,18 +454,6 @@ def test_a_long_star_among_round_ones_is_refused(options: CentroidOptions) -> No
     assert measured(pixels, xy, options).refusal[0] in (StarRefusal.ELONGATED, StarRefusal.BLEND)
 
 
-def test_stars_that_all_are_elongated_alike_are_measured() -> None:
-    # A lens with astigmatism, 10 % more variance along u: every star, so none is suspect.
-    xy = star_grid(11)
-    half = np.array([0.3, 0.0])
-    pairs = np.concatenate([xy + half, xy - half])
-    pixels = exposed(11, pairs, np.full(len(pairs), 4000.0), QUIET)
-    found = measured(pixels, xy)
-    assert (found.refusal == StarRefusal.NONE).mean() > 0.98
-    # A symmetric change of shape moves no centroid.
-    assert np.abs((found.xy_px - xy)[found.refusal == StarRefusal.NONE].mean(axis=0)).max() < 0.005
-
-
 def test_without_enough_bright_stars_the_width_is_not_known() -> None:
     xy = star_grid(12)[:3]
     pixels = exposed(12, xy, np.full(3, 8000.0), QUIET)
