@@ -36,7 +36,6 @@ from starcal_ros.camera import CameraModel, project, rotation_jacobian
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation import unknowns
-from starcal_ros.estimation import unknowns as module
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
@@ -62,7 +61,7 @@ def test_lateral_colour_is_a_change_of_the_focal_length(model: str) -> None:
     parameters = np.r_[[900.0, 0.0, 900.0], centre_px, np.zeros(len(LENSES[model].coefficients))]
     camera = CameraModel(WIDTH, HEIGHT, parameters, model)
     e = np.stack([0.8 * np.sin(angle), 0.6 * np.sin(angle), np.cos(angle)], axis=1)
-    turns = module._by_scale(model, e.T, e.T, np.zeros(7, np.int64))[:, 0]
+    turns = unknowns._by_scale(model, e.T, e.T, np.zeros(7, np.int64))[:, 0]
     moved_px = np.einsum('nab,bn->na', rotation_jacobian(camera, e), turns)
     # Without distortion, all that the focal length changes is the distance from the centre.
     assert moved_px == pytest.approx(project(camera, e) - centre_px, abs=1e-9)

@@ -157,14 +157,6 @@ def test_a_covariance_that_means_nothing_reaches_the_upper_limit_and_a_floor() -
     assert found.of(covariance, np.full(n, 5.0))[:, 0].mean() == pytest.approx(0.01, rel=0.1)
 
 
-def test_the_correction_is_f_times_scale_and_floor() -> None:
-    variance = CentroidVariance(2.0, 0.5, (1.0, 3.0), (4.0, 8.0))
-    covariance = np.array([[1.0, 0.25, 3.0], [1.0, 0.25, 3.0]])
-    assert variance.of(covariance, np.array([1.0, 2.0])) == pytest.approx(
-        np.array([[10.0, 2.0, 26.0], [15.0, 3.0, 39.0]])
-    )
-
-
 @pytest.mark.parametrize('bright_px', [0.005, 0.03])
 def test_scale_and_floor_maximise_the_restricted_likelihood(bright_px: float) -> None:
     """A bright star holds the shift of its image: counted as any other, it takes scale with it."""
