@@ -186,6 +186,17 @@ def test_a_value_that_the_images_contradict_is_not_asked_for() -> None:
     assert not [row for row in statements(sigma_budget(*found), *found) if 'slow' in row.option]
 
 
+def test_known_unknowns_do_not_depend_on_their_units() -> None:
+    found, _ = estimate(RAM)
+    errors = found.posterior.errors
+    assert errors is not None
+    scale = np.ones((len(errors.root), 1))
+    scale[found.linear.layout.places['velocity'].start] = 1e-24
+    rescaled = dataclasses.replace(errors, root=errors.root * scale)
+    T, again = (budget._known(one, found, ['velocity']) for one in (errors, rescaled))
+    np.testing.assert_allclose(again @ again.T, T @ T.T, atol=1e-9)
+
+
 def test_known_shapes_add_the_information_that_they_hide() -> None:
     breathing = World(6, breathing=3e-4)
     found, _ = estimate(breathing)
