@@ -202,7 +202,8 @@ def test_one_spoilt_star_is_left_out_by_its_reason(
 
 
 def noise(sky: np.ndarray, seed: int) -> np.ndarray:
-    return np.random.default_rng([8, seed]).normal(100, 5, sky.shape).astype(sky.dtype)
+    random = np.random.default_rng([8, seed]).normal(100, 5, sky.shape)
+    return np.asarray(random, sky.dtype)
 
 
 @pytest.mark.parametrize(
