@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 import dataclasses
+import functools
 
 import numpy as np
 
@@ -28,6 +29,15 @@ def star_grid(seed: int, spacing: int = 24, shape: tuple[int, int] = (512, 640))
     v, u = np.mgrid[spacing : shape[0] - spacing : spacing, spacing : shape[1] - spacing : spacing]
     phase = np.random.default_rng([seed, 0]).uniform(-0.5, 0.5, (u.size, 2))
     return np.asarray(np.stack([u.ravel(), v.ravel()], axis=-1) + phase)
+
+
+@functools.cache
+def corona() -> np.ndarray:
+    """A sky that falls off from one side, as beside the Sun."""
+    v, u = np.mgrid[:1024, :960]
+    light = 60000.0 / (1.0 + np.hypot(u + 100.0, v - 512.0) / 150.0) ** 2
+    electrons = np.random.default_rng(6).poisson(20.0 * (light + 500.0))
+    return np.asarray(np.rint(electrons / 20.0), np.uint16)
 
 
 def modelled(pixels: np.ndarray, options: CentroidOptions = CENTROIDS) -> ImageModel:

@@ -6,9 +6,9 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+from geometries import PRISM, RATIONAL  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from starcal_ros.camera import (
     ALL_PARAMETER_NAMES,
@@ -25,9 +25,6 @@ from starcal_ros.camera import (
 from starcal_ros.camera.lens import fold_radius2, LENSES
 from starcal_ros.camera.projection import convert, ros_fit
 
-#           k1   k2    k3    p1     p2     k4    k5   k6
-RATIONAL = [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02]
-PRISM = [2e-3, -1e-3, -1.5e-3, 5e-4]
 #                     fx     skew     fy     cx     cy     k1     k2     k3    p1     p2
 CAMERAS = {
     'paper': CameraModel(
@@ -84,22 +81,12 @@ def test_derivatives_by_the_parameters(camera: CameraModel) -> None:
     # The same sum in another order: 1e-12 px is five roundings of 2592 px.
     np.testing.assert_allclose(pixels, project(camera, e), rtol=0, atol=3e-12)
     for k, name in enumerate(camera.parameter_names):
-        value = camera.parameters[k]
-        size = np.abs(J[..., k]).max()
         complex_step = camera.parameters.astype(complex)
         complex_step[k] += 1e-30j
         exact = project_parameters(camera.model, complex_step, e).imag / 1e-30
         # A complex step has no truncation error and no cancellation: rounding alone.
-        np.testing.assert_allclose(J[..., k], exact, rtol=0, atol=1e-10 * size, err_msg=name)
-        h = 1e-3 * max(abs(value), 0.1)
-        ahead, behind = (camera.replace(**{name: value + d}) for d in (h, -h))
-        central = (project(ahead, e) - project(behind, e)) / (2 * h)
-        # Pixels are linear in each parameter alone, but for a denominator and a tilt, of which
-        # h^2 of the third derivative is left out; and rounding, 1e-12 px over the step.
-        linear = camera.model in ('plumb_bob', 'equidistant')
-        bend = 0.0 if linear else 1000 * h**2
-        atol = 3e-12 / h + (1e-9 + bend) * size
-        np.testing.assert_allclose(J[..., k], central, rtol=0, atol=atol, err_msg=name)
+        atol = 1e-10 * np.abs(J[..., k]).max()
+        np.testing.assert_allclose(J[..., k], exact, rtol=0, atol=atol, err_msg=name)
 
 
 @each_camera
@@ -112,19 +99,7 @@ def test_derivatives_by_a_passive_rotation(camera: CameraModel) -> None:
         # exp(-[theta x]) e to first order: e - theta x e = e + e x theta (Eqs. 11, 35).
         complex_step = e + 1e-30j * np.cross(e, theta)
         exact = project_parameters(camera.model, camera.parameters, complex_step).imag / 1e-30
-        size = np.abs(J).max()
-        np.testing.assert_allclose(J[..., axis], exact, rtol=0, atol=1e-10 * size)
-        h = 1e-4
-        ahead, behind = (Rotation.from_rotvec(-d * theta).apply(e) for d in (h, -h))
-        central = (project(camera, ahead) - project(camera, behind)) / (2 * h)
-        # The third derivative is a few times the first: h^2 of it is left out.
-        np.testing.assert_allclose(J[..., axis], central, rtol=0, atol=10 * h**2 * size)
-
-
-def fold_angle(camera: CameraModel) -> float:
-    """Angle from the optical axis at which the radial distortion folds over, rad."""
-    radius = np.sqrt(fold_radius2(camera.model, camera.distortion))
-    return float(radius if camera.model == 'equidistant' else np.arctan(radius))
+        np.testing.assert_allclose(J[..., axis], exact, rtol=0, atol=1e-10 * np.abs(J).max())
 
 
 @each_camera
@@ -135,20 +110,6 @@ def test_a_pixel_comes_back_from_its_line_of_sight(camera: CameraModel) -> None:
     # The inverse stops at 1e-14 of the image plane: 7e-11 px at the longest focal length here.
     np.testing.assert_allclose(project(camera, e), pixels, rtol=0, atol=1e-10)
     np.testing.assert_allclose(np.linalg.norm(e, axis=1), 1.0, rtol=0, atol=5e-16)
-
-
-@each_camera
-def test_a_direction_comes_back_from_its_pixel(camera: CameraModel) -> None:
-    # Directions that no inverse has made: over the cone in which the detector lies.
-    rng = np.random.default_rng(1)
-    inside = min(field_radius_rad(camera), 0.99 * fold_angle(camera))
-    theta = inside * np.sqrt(rng.uniform(size=300))
-    angle = rng.uniform(0, 2 * np.pi, 300)
-    rho = np.sin(theta)
-    e = np.stack([rho * np.cos(angle), rho * np.sin(angle), np.cos(theta)], axis=-1)
-    back = line_of_sight(camera, project(camera, e))
-    # 1e-14 of the image plane, a few times more where a barrel shrinks it.
-    np.testing.assert_allclose(back, e, rtol=0, atol=1e-13)
 
 
 @each_camera

@@ -24,7 +24,6 @@ from starcal_ros.estimation.amplitudes import (
     LARGEST_SHAPE_PX,
     log_amplitudes,
     LogPrior,
-    octave_prior,
     shapes,
     ShapeSums,
 )
@@ -67,16 +66,6 @@ def field(rng: Generator, sigma_px: Floats, each: int = 4, n: int = 60) -> Field
     b = sigma_px[octave] * rng.normal(size=len(octave))
     y = X @ b + Z @ (100.0 * rng.normal(size=5)) + rng.normal(size=n)
     return Field(X, y, null_space(Z.T), octave)
-
-
-def test_the_prior_of_octaves_is_a_chain() -> None:
-    mean, precision = octave_prior(4)
-    assert mean == pytest.approx(CENTRE + STEP * np.arange(4))
-    later = np.minimum.outer(np.arange(4), np.arange(4))
-    assert np.linalg.inv(precision) == pytest.approx(16.0 + later)
-    mean, precision = octave_prior(4, LogPrior(math.log(0.01), 1.5))
-    assert mean == pytest.approx(math.log(0.01) + STEP * np.arange(4))
-    assert np.linalg.inv(precision) == pytest.approx(2.25 + later)
 
 
 @pytest.mark.parametrize(('stated_px', 'low_px', 'high_px'), [(1e-4, 1e-4, 1e-3), (0.1, 0.1, 0.3)])

@@ -144,11 +144,7 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
 @each_method
 def test_the_order_of_the_names_does_not_matter(method: str) -> None:
     noisy = with_noise(clean(), 1, TRACKER_ARCSEC)
-    names = NAMES
-    one, other = (
-        estimate_calibration(noisy, PRIOR, options(method, estimate=order))
-        for order in (names, names[::-1])
-    )
+    one, other = (estimated(noisy, method, estimate=order) for order in (NAMES, NAMES[::-1]))
     np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
@@ -182,24 +178,6 @@ def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
         assert 0.9 < np.sqrt(found_px2 / expected_px2) < 1.1
         in_sigma = [normalised(error, bound) for error in errors]
         assert_true_to_its_covariance(in_sigma, 8)
-
-
-@pytest.mark.slow
-def test_hierarchical_is_no_worse_than_the_better_of_the_others() -> None:
-    # With a useless tracker it is per-image, with a perfect one it is single.
-    noisy = with_noise(clean(), 1, TRACKER_ARCSEC)
-    loose = {'star_tracker_sigma_arcsec': (3600.0, 3600.0, 3600.0)}
-    tight = {'star_tracker_sigma_arcsec': (1e-3, 1e-3, 1e-3)}
-    one, other = (estimated(noisy, m, **loose) for m in ('hierarchical', 'per_image'))
-    # 50 arcsec of disagreement in 3600: the prior pulls by 1e-4 of a sigma or so.
-    assert apart_sigma(one, other, FREE) < 0.01
-    np.testing.assert_allclose(sigma_of(one, FREE), sigma_of(other, FREE), rtol=0.01)
-    perfect = with_noise(clean(), 1, (0.0, 0.0, 0.0))
-    one, other = (estimated(perfect, m, **tight) for m in ('hierarchical', 'single'))
-    # The errors that the stars show of a perfect star tracker are their own noise, which its
-    # sigma takes in: hierarchical does not trust it as single does.
-    assert apart_sigma(one, other) < 1.0
-    assert (sigma_of(one, FREE) < 2.0 * sigma_of(other, FREE)).all()
 
 
 def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ensemble, list[Mask]]:
@@ -260,26 +238,6 @@ def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_sca
     assert_true_to_its_covariance(errors, 11)
     # chi^2 per degree of freedom as given says it, to 0.6 % in 10 trials.
     assert np.mean(factors) == pytest.approx(centroid_scale**2, rel=0.02)
-
-
-@pytest.mark.slow
-@each_method
-def test_images_of_very_unlike_star_counts(method: str) -> None:
-    sizes = (3, 4, 8, 15, 30, 60, 120, 250, 300, 5)
-    images = tuple(
-        image.select(np.arange(len(image)) % max(len(image) // n, 1) == 0)
-        for image, n in zip(clean().images, sizes, strict=True)
-    )
-    errors = [
-        chi2_of(
-            estimate_calibration(
-                with_noise(Ensemble(images), k, tracker_of(method)), PRIOR, options(method)
-            )
-        )
-        for k in range(20)
-    ]
-    # 800 stars: their variance is known to 5 %, so chi squared is a little wider; 99 % all same.
-    assert_true_to_its_covariance(errors, 11)
 
 
 @pytest.mark.parametrize('method', METHODS)
@@ -363,10 +321,6 @@ def test_weights_follow_the_state_that_is_taken() -> None:
     assert found.termination == 'converged'
 
 
-class EnoughRounds(Exception):
-    """The rounds of an estimate that a test looks at are done."""
-
-
 def test_images_follow_a_velocity_in_a_partial_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """A velocity is not in the state: it is at its mean though the state moves by a quarter."""
     whole: Callable[..., Any] = calibrate._round
@@ -374,12 +328,10 @@ def test_images_follow_a_velocity_in_a_partial_step(monkeypatch: pytest.MonkeyPa
 
     def partial(*arguments: Any) -> Any:
         last = whole(*arguments[:-1], 0.25)
-        data, kept = arguments[0], arguments[3].kept
-        image, residual_px = data.table.image[kept], last.residual_px[kept]
+        kept = arguments[3].kept
+        image, residual_px = arguments[0].table.image[kept], last.residual_px[kept]
         means = [np.bincount(image, one) / np.bincount(image) for one in residual_px.T]
         off_px.append(float(np.abs(means).max()))
-        if len(off_px) == 3:
-            raise EnoughRounds
         return last
 
     monkeypatch.setattr(calibrate, '_round', partial)
@@ -387,6 +339,5 @@ def test_images_follow_a_velocity_in_a_partial_step(monkeypatch: pytest.MonkeyPa
     world = worlds.World(6, 'side_level', velocity_m_s=30000.0, **bright)
     made = worlds.simulate(world, 1)
     options = CalibrationOptions(star_tracker_sigma_arcsec=(20.0,) * 3, shutter='global')
-    with pytest.raises(EnoughRounds):
-        estimate_calibration(made.ensemble, made.scenario.prior, options)
+    estimate_calibration(made.ensemble, made.scenario.prior, options)
     assert max(off_px) < 0.01

@@ -108,17 +108,6 @@ def test_an_image_that_nothing_holds_stays_and_adds_nothing(given: Small) -> Non
     assert scaled(arrow.information - information, N[:P, :P] + np.eye(P) * 1e-300) < EXACT
 
 
-def test_an_image_that_its_star_tracker_alone_holds_follows_it(given: Small) -> None:
-    keep = given.keep & (given.table.image != 1)
-    without = dataclasses.replace(given, keep=keep)
-    arrow = equations(without.sums(), without.linear(), SHAPE)
-    at = given.layout.of(['alignment'])
-    # Its rotation is that of the alignment in the camera frame of its temperature.
-    entry = given.layout['alignment'].tracker
-    assert entry is not None
-    assert arrow.back[1][:3, at] == pytest.approx(-entry[1], abs=1e-9)
-
-
 def test_a_star_behind_the_camera_is_named(given: Small) -> None:
     direction = given.table.direction_icrf.copy()
     direction[3] *= -1.0

@@ -221,7 +221,7 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
         SharedError('cells', cells, np.full(n, cell_px**2), 0.0, False, 1.0),
         SharedError('rows', rng.integers(0, 5, n), np.full(n, 0.5), 0.0, False, 0.0),
     )
-    inflation = rng.uniform(0.0, 0.002, n)
+    inflation = rng.uniform(0.0, 0.5, n)
     variance = (place_px**2 + cell_px**2) * rng.uniform(0.5, 2.0, n)
     trackers = []
     for rows, group in (

@@ -104,8 +104,7 @@ def numerical(given: Ensemble, minimum: Minimum) -> Residuals:
     state, table = minimum.state, star_table(given.images)
     f, q, axes = len(FREE), len(state.focal), len(state.rate)
     measured = [Rotation.from_quat(i.icrf_from_star_tracker_xyzw).inv() for i in given.images]
-    uu, uv, vv = table.covariance_px2.T
-    C = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-2)
+    C = table.covariance_px2[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     root_weight = np.linalg.cholesky(np.linalg.inv(C)).transpose(0, 2, 1)
     sigma_rad = np.array(TRACKER_ARCSEC) * ARCSECOND_RAD
 

@@ -14,7 +14,6 @@ from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.amplitudes import LARGEST_FIELD_PX, log_amplitudes
 from starcal_ros.estimation.shared_errors import (
     chain_means,
-    group_sums,
     observation_groups,
     pair_moment,
     pairs_of,
@@ -110,6 +109,28 @@ def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes() -> None:
     assert found[0] == pytest.approx(4e-4, rel=0.3) and found[1] < found[0]
 
 
+def errors_of(
+    residual: Floats,
+    variance: Floats,
+    pixels: Floats,
+    star: Indices,
+    last: tuple[Floats, Floats],
+    from_sky: Floats | None = None,
+) -> tuple[SharedError, ...]:
+    """Errors that all observations (n,) share; images are not rolled unless that is given."""
+    n = len(residual)
+    kinds = observation_groups(pixels, star, WIDTH)
+    rolled = np.tile(np.eye(2), (n, 1, 1)) if from_sky is None else from_sky
+    return shared_errors(residual, variance, np.ones(n, bool), kinds, rolled, last)
+
+
+def random_rolls(rng: Generator, images: int, each: int = 1) -> Floats:
+    """Rotations (images * each, 2, 2) from the sky to the detector, those of an image alike."""
+    angle = np.repeat(rng.uniform(0.0, 2.0 * np.pi, images), each)
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.stack([np.stack([cos, -sin], 1), np.stack([sin, cos], 1)], 1)
+
+
 def campaign(
     rng: Generator, place_px: float = 0.0, cells_px: float = 0.0
 ) -> tuple[SharedError, ...]:
@@ -121,9 +142,7 @@ def campaign(
     m, n, noise_px = 30, 60, 0.1
     star = np.tile(np.arange(n), m)
     pixels = rng.uniform(0.0, WIDTH - 1.0, (m * n, 2))
-    angle = np.repeat(rng.uniform(0.0, 2.0 * np.pi, m), n)
-    cos, sin = np.cos(angle), np.sin(angle)
-    from_sky = np.stack([np.stack([cos, -sin], 1), np.stack([sin, cos], 1)], 1)
+    from_sky = random_rolls(rng, m, n)
     place = place_px * rng.normal(size=(n, 2))
     residual = noise_px * rng.normal(size=(m * n, 2))
     residual += np.einsum('nij,nj->ni', from_sky, place[star])
@@ -131,9 +150,7 @@ def campaign(
     cell = ((pixels + 0.5) / size).astype(int)
     residual += (cells_px * rng.normal(size=(100, 100, 2)))[cell[:, 0], cell[:, 1]]
     last = np.log([1e-5, 1e-4, 1e-3, 1e-2]), np.full(4, 0.25)
-    variance, used = np.full(m * n, noise_px**2), np.ones(m * n, bool)
-    kinds = observation_groups(pixels, star, WIDTH)
-    return shared_errors(residual, variance, used, kinds, from_sky, last)
+    return errors_of(residual, np.full(m * n, noise_px**2), pixels, star, last, from_sky)
 
 
 def test_the_errors_have_their_names_and_groups() -> None:
@@ -160,11 +177,8 @@ def test_each_error_has_its_likelihood_ratio_and_its_effect() -> None:
     pixels = rng.uniform(0.0, 1199.0, (n, 2))
     star, variance = rng.integers(0, 60, n), rng.uniform(0.1, 0.4, n) ** 2
     residual = rng.normal(size=(n, 2)) * np.sqrt(variance)[:, None]
-    from_sky = np.tile(np.eye(2), (n, 1, 1))
     last = np.log([1e-4, 1e-2]), np.array([0.5, 0.5])
-    kinds = observation_groups(pixels, star, WIDTH)
-    used = np.ones(n, bool)
-    found = shared_errors(residual, variance, used, kinds, from_sky, last)
+    found = errors_of(residual, variance, pixels, star, last)
     ratios = []
     of_star = found[0]
     # Cells are compared by the weights of stars of several sightings.
@@ -184,27 +198,6 @@ def test_each_error_has_its_likelihood_ratio_and_its_effect() -> None:
         assert error.effect == pytest.approx(expected, rel=1e-9)
         assert error.matters is (expected > (0.02 if error.of_star else 0.01))
     assert min(ratios) < 0.0 < max(ratios) < 3.0
-
-
-def test_cells_are_a_sixth_of_a_wave() -> None:
-    n = 200
-    rng = np.random.default_rng(5)
-    pixels = rng.uniform(0.0, 1199.0, (n, 2))
-    found = shared_errors(
-        rng.normal(size=(n, 2)),
-        np.ones(n),
-        np.ones(n, bool),
-        observation_groups(pixels, np.arange(n), WIDTH),
-        np.tile(np.eye(2), (n, 1, 1)),
-        (np.zeros(1), np.ones(1)),
-    )
-    for error, wave in zip(found[1:], (1 / 4, 1 / 8, 1 / 16), strict=True):
-        keys = pixels.T // (WIDTH * wave / 6)
-        same = np.equal.outer(error.group, error.group)
-        expected = (keys[:, :, None] == keys[:, None, :]).all(axis=0)
-        # Half a pixel: the first pixel begins at -0.5.
-        assert (same != expected).mean() < 0.02
-        assert same[expected].mean() > 0.5
 
 
 @pytest.mark.parametrize(
@@ -248,15 +241,8 @@ def stare(
     moved[::10] += blend * sigma[::10, None] * [0.6, 0.8]
     noise = math.sqrt(1.0 - rho) * sigma[star, None] * rng.normal(size=(m * n, 2))
     variance = sigma[star] ** 2 * (1.0 + 0.05 * blend**2) + place_px**2
-    found = shared_errors(
-        moved[star] + noise,
-        variance,
-        np.ones(m * n, bool),
-        observation_groups(pixels, star, WIDTH),
-        np.tile(np.eye(2), (m * n, 1, 1)),
-        (np.log([1e-5, 1e-3]), np.full(2, 0.5)),
-    )
-    return found, sigma[star], moved
+    last = np.log([1e-5, 1e-3]), np.full(2, 0.5)
+    return errors_of(moved[star] + noise, variance, pixels, star, last), sigma[star], moved
 
 
 @pytest.mark.parametrize(
@@ -293,14 +279,9 @@ def test_what_stars_of_one_field_share_may_be_structure_of_the_detector(of_star:
         phase = rng.uniform(0.0, 2.0 * np.pi, (2, 2))
         wave = np.sin(2.0 * np.pi / 270.0 * pixels[:, None, :] + phase).prod(axis=2)
         moved = rng.normal(size=(n, 2))[star] if of_star else 2.0 * wave
-        found = shared_errors(
-            size_px * moved + 0.2 * rng.normal(size=(m * n, 2)),
-            np.full(m * n, 0.2**2 + size_px**2),
-            np.ones(m * n, bool),
-            observation_groups(pixels, star, WIDTH),
-            np.tile(np.eye(2), (m * n, 1, 1)),
-            (np.log([1e-6, 1e-5, 1e-4]), np.full(3, 1.0 / 3.0)),
-        )
+        residual = size_px * moved + 0.2 * rng.normal(size=(m * n, 2))
+        last = np.log([1e-6, 1e-5, 1e-4]), np.full(3, 1.0 / 3.0)
+        found = errors_of(residual, np.full(m * n, 0.2**2 + size_px**2), pixels, star, last)
         assert found[0].variance_px2 == pytest.approx(size_px**2, rel=0.4)
         variances.append(pixel_variance_px2(found))
     share = float(np.mean(variances)) / size_px**2
@@ -327,48 +308,3 @@ def test_two_stars_in_the_same_cell_again_and_again_are_one_pair() -> None:
     assert len(ratios) == 60
     assert np.count_nonzero(np.array(ratios) > 5.41) <= 2  # 1 %, one-sided, and one by chance
     assert max(ratios) < 16.0
-
-
-def test_sums_over_groups_are_those_of_all_pairs() -> None:
-    rng = np.random.default_rng(6)
-    n, r = 40, 3
-    Y = rng.normal(size=(n, 2, r))
-    angle = rng.uniform(0.0, 6.0, n)
-    cos, sin = np.cos(angle), np.sin(angle)
-    from_sky = np.stack([np.stack([cos, -sin], 1), np.stack([sin, cos], 1)], 1)
-    star, cell = rng.integers(0, 25, n), rng.integers(-1, 5, n)  # in no cell: not used
-    used = np.flatnonzero(cell >= 0)
-    star[cell < 0] = -1
-    of_place = rng.uniform(0.2, 0.4, n)
-    errors = (
-        SharedError('star places', star, of_place, 0.0, True, 1.0),
-        SharedError('cells', cell, np.full(n, 0.05), 0.0, False, 1.0),
-        SharedError('nothing', cell, np.full(n, 0.4), 0.0, False, 0.009),
-    )
-    variance = rng.uniform(0.1, 0.6, n)
-    sizes = {-1: 0, **{k: int((star == k).sum()) for k in range(25)}}
-    assert min(sizes[k] for k in star[used]) == 1 < max(sizes.values())
-    total = 0.05 + of_place * np.array([sizes[k] > 1 for k in star])
-    # Bright stars share no more than their own variance.
-    share = np.minimum(variance / total, 1.0)
-    assert (share[used] < 1.0).any() and (share[used] == 1.0).any()
-    inflation = rng.uniform(0.0, 0.2, n)
-    of_stars, of_cells, own = np.zeros((3, r, r))
-    for i in used:
-        own += (share[i] * total[i] + inflation[i]) * Y[i].T @ Y[i]
-        for j in used:
-            common = math.sqrt(share[i] * share[j])
-            if star[i] == star[j] and sizes[star[i]] > 1:
-                place = common * math.sqrt(of_place[i] * of_place[j])
-                of_stars += place * Y[i].T @ from_sky[i] @ from_sky[j].T @ Y[j]
-            if cell[i] == cell[j]:
-                of_cells += 0.05 * common * Y[i].T @ Y[j]
-    parts = [
-        (part, Y[part].transpose(1, 0, 2)) for part in np.array_split(rng.permutation(used), 3)
-    ]
-    whole, alone = group_sums(errors, variance, inflation, from_sky, parts, r)
-    assert list(whole) == ['star places', 'cells']
-    assert whole['star places'] == pytest.approx(of_stars, abs=1e-10)
-    assert whole['cells'] == pytest.approx(of_cells, abs=1e-10)
-    assert alone == pytest.approx(own, abs=1e-10)
-    assert group_sums((), variance, inflation, from_sky, parts, r)[0] == {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import dataclasses
 
+from geometries import COEFFICIENTS  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,6 @@ from starcal_ros.estimation.star_equations import (
     squared_sigmas,
     star_table,
     StarTable,
-    whitening,
 )
 from starcal_ros.records import StarObservations
 
@@ -68,22 +68,11 @@ def dense_blocks(
         R = rotations[table.image[k]]
         pixel, J_parameters, J_rotation = project_jacobians(camera, R @ table.direction_icrf[k])
         r = table.measured_px[k] - pixel
-        uu, uv, vv = table.covariance_px2[k]
-        W = np.linalg.inv(np.array([[uu, uv], [uv, vv]]))
+        W = np.linalg.inv(table.covariance_px2[k, [0, 1, 1, 2]].reshape(2, 2))
         J = np.concatenate([J_parameters, J_rotation, r[:, None]], axis=1)
         squared.append(r @ W @ r)
         blocks[table.image[k]] += J.T @ W @ J / (1.0 + squared[-1] / loss_scale**2)
     return np.array(squared), blocks
-
-
-RATIONAL = [-0.05, 0.1, 0.2, 4e-4, -3e-4, 0.35, 0.1, 0.02]
-COEFFICIENTS = {
-    'plumb_bob': RATIONAL[:5],
-    'rational_polynomial': RATIONAL,
-    'thin_prism': [*RATIONAL, 2e-3, -1e-3, -1.5e-3, 5e-4],
-    'tilted': [*RATIONAL, 2e-3, -1e-3, -1.5e-3, 5e-4, 0.02, -0.03],
-    'equidistant': [-0.02, 0.01, -0.004, 5e-4],
-}
 
 
 @pytest.mark.parametrize('model', LENSES)
@@ -107,34 +96,29 @@ def test_blocks_equal_the_dense_normal_matrices(model: str) -> None:
         assert blocks[k].any() == (n > 0)
 
 
+def of_stars(
+    table: StarTable, keep: np.ndarray, rotations: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Cost and blocks of the kept stars in the usual camera."""
+    measurements = arrange(table, keep, table.covariance_px2)
+    return normal_blocks(measurements, 'plumb_bob', CAMERA_MODEL.parameters, rotations)
+
+
 def test_images_spread_over_many_chunks_come_back_to_their_places() -> None:
     sizes = tuple(int(n) for n in np.random.default_rng(3).integers(0, 700, 30))
     table, rotations = made(sizes, seed=3)
     everything = np.ones(len(table), bool)
-    measurements = arrange(table, everything, table.covariance_px2)
-    assert len(measurements.chunks) > 3
-    together = normal_blocks(measurements, 'plumb_bob', CAMERA_MODEL.parameters, rotations)
-    cost = 0.0
-    for k in range(len(sizes)):
-        alone, blocks = normal_blocks(
-            arrange(table, table.image == k, table.covariance_px2),
-            'plumb_bob',
-            CAMERA_MODEL.parameters,
-            rotations,
-        )
-        cost += alone
-        np.testing.assert_allclose(together[1][k], blocks[k], rtol=1e-9, atol=1e-6)
-    assert together[0] == pytest.approx(cost, rel=1e-12)
+    assert len(arrange(table, everything, table.covariance_px2).chunks) > 3
+    cost, together = of_stars(table, everything, rotations)
+    alone = [of_stars(table, table.image == k, rotations) for k in range(len(sizes))]
+    for k, (_, blocks) in enumerate(alone):
+        np.testing.assert_allclose(together[k], blocks[k], rtol=1e-9, atol=1e-6)
+    assert cost == pytest.approx(sum(one for one, _ in alone), rel=1e-12)
 
 
 def test_no_star_at_all() -> None:
     table, rotations = made((0, 0))
-    cost, blocks = normal_blocks(
-        arrange(table, np.zeros(0, bool), table.covariance_px2),
-        'plumb_bob',
-        CAMERA_MODEL.parameters,
-        rotations,
-    )
+    cost, blocks = of_stars(table, np.zeros(0, bool), rotations)
     assert cost == 0.0 and blocks.shape == (2, 14, 14) and not blocks.any()
 
 
@@ -160,27 +144,13 @@ def test_the_robust_loss_is_cauchys(loss_scale: float) -> None:
 def test_a_star_behind_the_camera_has_no_finite_cost() -> None:
     table, rotations = made()
     rotations[4] = np.diag([1.0, -1.0, -1.0]) @ rotations[4]
-    cost, _ = normal_blocks(
-        arrange(table, np.ones(len(table), bool), table.covariance_px2),
-        'plumb_bob',
-        CAMERA_MODEL.parameters,
-        rotations,
-    )
-    assert cost == np.inf
+    assert of_stars(table, np.ones(len(table), bool), rotations)[0] == np.inf
 
 
-def test_whitening_is_the_inverse_root_of_the_covariance() -> None:
+def test_lengths_in_sigma_are_those_of_the_inverse_covariances() -> None:
     table, _ = made()
-    wuu, wuv, wvv = whitening(table.covariance_px2)
-    zero = np.zeros_like(wuu)
-    W = np.stack([np.stack([wuu, wuv], axis=-1), np.stack([zero, wvv], axis=-1)], axis=-2)
-    uu, uv, vv = table.covariance_px2.T
-    C = np.stack([np.stack([uu, uv], axis=-1), np.stack([uv, vv], axis=-1)], axis=-2)
-    identity = W @ C @ W.transpose(0, 2, 1)
-    # The thinnest of these covariances have a condition of some hundreds.
-    np.testing.assert_allclose(
-        identity, np.broadcast_to(np.eye(2), identity.shape), rtol=0, atol=1e-11
-    )
     r = np.random.default_rng(5).normal(size=(len(table), 2))
+    C = table.covariance_px2[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
     expected = np.einsum('ni,nij,nj->n', r, np.linalg.inv(C), r)
+    # The thinnest of these covariances have a condition of some hundreds.
     np.testing.assert_allclose(squared_sigmas(r, table.covariance_px2), expected, rtol=1e-9)

@@ -179,22 +179,6 @@ def test_the_sigma_of_the_mean_covers_white_noise_and_walks(
     assert low < rms < high
 
 
-@pytest.mark.parametrize('size', [0.6, 1.0, 1000.0])
-@pytest.mark.parametrize('m', [3, 24])
-def test_the_images_outweigh_a_stated_sigma(size: float, m: int) -> None:
-    rng = np.random.default_rng(9)
-    over, sizes = [], []
-    for _ in range(40):
-        error = size * rng.normal(size=(m, 3))
-        found = found_of(error)
-        over.append(error.mean(axis=0) * math.sqrt(m) / found.working)
-        sizes.append(math.hypot(found.noise, found.slow) / size)
-    assert math.sqrt(np.mean(np.square(over))) < 1.0
-    assert np.mean(np.abs(over) > 2.0) < 0.08
-    # Few images do not tell noise from slow errors.
-    assert 1.0 < np.median(sizes) < 2.0
-
-
 def test_times_may_be_equal() -> None:
     error = np.random.default_rng(8).normal(size=(5, 3))
     attitudes = Rotation.random(5, random_state=np.random.default_rng(1))

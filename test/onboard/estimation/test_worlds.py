@@ -130,15 +130,7 @@ def test_outliers_and_bad_stars_are_left_out() -> None:
     # Displacements of 1 to 20 px of one star in twenty; those of under 4.5 sigma stay.
     assert 0.03 < (~found.kept).mean() < 0.06
     assert per_number(found, made.scenario.truth, slice(0, 10)) < chi2.isf(1e-4, 10) / 10
-    bad = simulate(WORLDS['badstars'], 1)
-    dropped = estimated(bad).dropped_catalog_id
-    assert 5 <= len(dropped) <= 10
-    pairs = [
-        (image.catalog_id[k], k, image)
-        for image in bad.ensemble.images
-        for k in np.flatnonzero(np.isin(image.catalog_id, dropped))
-    ]
-    assert len({int(star) for star, _, _ in pairs}) == len(dropped)
+    assert 5 <= len(estimated(simulate(WORLDS['badstars'], 1)).dropped_catalog_id) <= 10
 
 
 def with_attitude_errors(made: Campaign, rad: Floats, names: list[str]) -> Campaign:

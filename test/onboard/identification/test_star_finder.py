@@ -7,7 +7,7 @@ from collections.abc import Callable
 import dataclasses
 import functools
 
-from geometries import turn_between, turned  # type: ignore[import-not-found]
+from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from sample_sky import errors_sigma, exposure_of, true_px, with_planets  # type: ignore[import-not-found]
@@ -20,16 +20,9 @@ from starcal_ros.identification.star_finder import (
     Exposure,
     IdentificationOptions,
     observe_stars,
-    realigned,
     StarSearch,
 )
-from starcal_ros.records import (
-    CameraGeometry,
-    Image,
-    refused_image,
-    STAR_REFUSALS,
-    StarObservations,
-)
+from starcal_ros.records import CameraGeometry, Image, STAR_REFUSALS, StarObservations
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 from starcal_ros.stars.image_model import CentroidOptions
 
@@ -112,7 +105,6 @@ def test_a_focal_length_two_percent_off_is_acquired(scale: float) -> None:
 @pytest.mark.slow
 def test_a_wrong_attitude_never_matches() -> None:
     # Anywhere in the sky: that one of 100 comes within 1.5 degrees is a chance of 0.02.
-    refused = 0
     for index in range(5):
         _, image = shown(index)
         for seed in range(20):
@@ -120,8 +112,6 @@ def test_a_wrong_attitude_never_matches() -> None:
             with pytest.raises(ImageRefused) as refusal:
                 observed(image, attitude)
             assert refusal.value.reason == 'no_match'
-            refused += 1
-    assert refused == 100
 
 
 def test_hot_pixels_and_missing_and_strange_stars() -> None:
@@ -211,30 +201,28 @@ def test_one_spoilt_star_is_left_out_by_its_reason(
     assert reason in STAR_REFUSALS
 
 
-def test_an_empty_image_has_no_stars() -> None:
-    one, image = shown(0)
-    for level in (0, 4095):
-        pixels = np.full((512, 640), level).astype(np.uint16)
-        with pytest.raises(ImageRefused) as refusal:
-            observed(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw)
-        assert refusal.value.reason == 'no_stars'
+def noise(sky: np.ndarray, seed: int) -> np.ndarray:
+    random = np.random.default_rng([8, seed]).normal(100, 5, sky.shape)
+    return np.asarray(random, sky.dtype)
 
 
-def test_noise_alone_matches_nothing() -> None:
-    one, image = shown(0)
-    rng = np.random.default_rng(8)
-    for _ in range(5):
-        noise = rng.normal(100, 5, image.pixels.shape).astype(np.uint16)
-        with pytest.raises(ImageRefused) as refusal:
-            observed(Image(image.time_ns, noise), one.icrf_from_star_tracker_xyzw)
-        assert refusal.value.reason in ('no_stars', 'no_match')
-
-
-def test_a_mirrored_image_matches_nothing() -> None:
+@pytest.mark.parametrize(
+    ('made_of', 'refusals'),
+    [
+        (lambda sky: np.zeros_like(sky), ['no_stars']),
+        (lambda sky: np.full_like(sky, 4095), ['no_stars']),
+        *((functools.partial(noise, seed=k), ['no_stars', 'no_match']) for k in range(5)),
+        (lambda sky: sky[:, ::-1].copy(), ['no_match']),
+    ],
+    ids=['dark', 'bright', *map('noise {}'.format, range(5)), 'mirrored'],
+)
+def test_an_image_without_the_stars_matches_nothing(
+    made_of: Callable[[np.ndarray], np.ndarray], refusals: list[str]
+) -> None:
     one, image = shown(1)
-    mirrored = Image(image.time_ns, image.pixels[:, ::-1].copy())
-    with pytest.raises(ImageRefused, match='no_match'):
-        observed(mirrored, one.icrf_from_star_tracker_xyzw)
+    with pytest.raises(ImageRefused) as refusal:
+        observed(Image(image.time_ns, made_of(image.pixels)), one.icrf_from_star_tracker_xyzw)
+    assert refusal.value.reason in refusals
 
 
 def test_too_few_stars_are_refused() -> None:
@@ -256,19 +244,6 @@ def test_refused_stars_are_told_with_their_places() -> None:
     assert counted == found.refused_stars and {'blend', 'faint'} <= set(counted)
     # The match refines the predictions to a fraction of the pixel in which a star is looked for.
     assert np.abs(found.refused_px - true_px(one, found.refused_catalog_id)).max() < 0.5
-
-
-def test_the_geometry_is_tracked_from_image_to_image() -> None:
-    turn = Rotation.from_euler('xyz', [0.8, -0.6, 3.0], degrees=True)
-    off = turned(PRIOR, turn)
-    one, image = shown(5)
-    found = observed(image, one.icrf_from_star_tracker_xyzw, off)
-    after = realigned(off, found)
-    # One error of the tracker, (10, 10, 40) arcsec, and what the prior camera is off by.
-    assert np.degrees(turn_between(TRUTH, after).magnitude()) * 3600 < 200
-    np.testing.assert_array_equal(after.camera.parameters, off.camera.parameters)
-    lost = refused_image(image.time_ns, 640, 512, 'no_match', '')
-    assert realigned(off, lost) is off
 
 
 def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(

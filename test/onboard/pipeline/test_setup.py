@@ -10,7 +10,7 @@ from astropy.io import fits
 import cv2
 import numpy as np
 import pytest
-from tiny_campaign import attitudes, image, SCENARIO, values  # type: ignore[import-not-found]
+from tiny_campaign import attitudes, image, SCENARIO, values, write_png  # type: ignore[import-not-found]
 
 from bench.narrow import scenario_of
 from starcal_ground.products import write_camera_info
@@ -44,25 +44,18 @@ def test_a_deep_catalog_need_not_cover_the_sky() -> None:
 
 
 def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
-    made = load_setup(
-        values(
-            camera_yaml,
-            centroid='moment',
-            method='single',
-            estimate=['fx', 'fy'],
-            max_attitude_gap_s=7,
-            magnitude_limit=6.0,
-            max_change_px=0.3,
-            camera_frame='left_eye',
-            use_sim_time=True,
-        )
-    )
-    assert made.centroid.centroid == 'moment'
-    assert made.calibration.method == 'single'
-    assert made.calibration.estimate == ('fx', 'fy')
-    assert made.attitude.max_attitude_gap_s == 7.0
-    assert made.gate.max_change_px == 0.3
-    assert made.frames.camera_frame == 'left_eye'
+    stated: dict[str, object] = {
+        'centroid': 'moment',
+        'method': 'single',
+        'estimate': ('fx', 'fy'),
+        'max_attitude_gap_s': 7.0,
+        'magnitude_limit': 6.0,
+        'max_change_px': 0.3,
+        'camera_frame': 'left_eye',
+    }
+    # Parameters of a node are known, and left to it.
+    made = load_setup(values(camera_yaml, **stated, use_sim_time=True, autostart=False))
+    assert stated.items() <= made.options().items()
     assert made.catalog.magnitude.max() <= 6.0
     assert made.detector.dark is None
     np.testing.assert_array_equal(made.prior.camera.parameters, SCENARIO.prior.camera.parameters)
@@ -99,10 +92,6 @@ def test_a_rounded_alignment_is_made_unit(camera_yaml: Path) -> None:
     q = np.round(SCENARIO.prior.star_tracker_from_camera_xyzw, 4)
     made = load_setup(values(camera_yaml, prior_alignment=q.tolist()))
     assert np.linalg.norm(made.prior.star_tracker_from_camera_xyzw) == pytest.approx(1, abs=1e-15)
-
-
-def test_the_parameters_of_a_node_are_known_where_it_asks(camera_yaml: Path) -> None:
-    load_setup(values(camera_yaml, autostart=False))
 
 
 def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
@@ -264,22 +253,26 @@ def test_a_bad_pixel_is_left_out_of_the_stars(camera_yaml: Path, tmp_path: Path)
     u, v = np.rint(before.measured_px[star]).astype(int)
     bad = np.zeros((HEIGHT, WIDTH), np.uint8)
     bad[v, u] = 1
-    cv2.imwrite(str(tmp_path / 'bad.png'), bad)
-    setup = load_setup(values(camera_yaml, bad_pixel_map=str(tmp_path / 'bad.png')))
+    path = write_png(tmp_path / 'bad.png', bad)
+    setup = load_setup(values(camera_yaml, bad_pixel_map=path))
     assert setup.detector.hot.index.tolist() == [v * WIDTH + u]
     after = observed(image().pixels, setup)
     assert before.catalog_id[star] not in after.catalog_id
     assert after.refused_stars['hot_pixel'] == before.refused_stars.get('hot_pixel', 0) + 1
 
 
-def test_pixels_without_response_are_bad(camera_yaml: Path, tmp_path: Path) -> None:
-    flat = np.full((HEIGHT, WIDTH), 1000, np.uint16)
-    flat[7, 9] = 50
-    cv2.imwrite(str(tmp_path / 'flat.png'), flat)
-    setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
+@pytest.mark.parametrize(
+    ('option', 'usual', 'bad'), [('flat_field', 1000, 50), ('dark_frame', 32, 60)]
+)
+def test_pixels_without_response_or_with_a_current_are_bad(
+    camera_yaml: Path, tmp_path: Path, option: str, usual: int, bad: int
+) -> None:
+    frame = np.full((HEIGHT, WIDTH), usual, np.uint16)
+    frame[7, 9] = bad
+    path = write_png(tmp_path / 'frame.png', frame)
+    setup = load_setup(values(camera_yaml, **{option: path}))
     assert setup.detector.hot.index.tolist() == [7 * WIDTH + 9]
-    same = flattened(image(), setup.detector.flat, 0)
-    assert (same.pixels == image().pixels).all()
+    assert (flattened(image(), setup.detector.flat, 0).pixels == image().pixels).all()
 
 
 def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
@@ -292,8 +285,8 @@ def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
         flat *= 1.0 - 0.2 * np.exp(-(np.hypot(u - place[0], v - place[1]) ** 2) / 8.0)
     flat[:, 100:110] *= 1.3
     counts = np.random.default_rng(9).poisson(20000.0 * flat).astype(np.uint16)
-    cv2.imwrite(str(tmp_path / 'flat.png'), counts)
-    setup = load_setup(values(camera_yaml, flat_field=str(tmp_path / 'flat.png')))
+    path = write_png(tmp_path / 'flat.png', counts)
+    setup = load_setup(values(camera_yaml, flat_field=path))
     assert setup.detector.flat is not None
 
 

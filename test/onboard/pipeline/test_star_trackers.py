@@ -19,9 +19,8 @@ from starcal_ground.bags.topics import Topics
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
 from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, NODES, Setup
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import StarObservations
 
 FIRST_FROM_OTHER = Rotation.from_euler('xyz', [100.0, -20.0, 35.0], degrees=True)
 # Two pixels of this camera: the mounting as assumed is wrong by more than a star is wide.
@@ -70,26 +69,6 @@ def observed(bag: Path, setup: Setup) -> list[StarObservations]:
 
 def used(records: list[StarObservations]) -> Counter[str]:
     return Counter(record.star_tracker for record in records if not record.refusal)
-
-
-@pytest.mark.slow
-def test_both_star_trackers_are_used_and_aligned(tmp_path: Path) -> None:
-    setup = setup_with()
-    records = observed(bag_of(tmp_path / 'two'), setup)
-    assert used(records) == {'': 5, 'other': 5}
-    calibration = solve.solve(Ensemble(tuple(records)), setup)
-    first, other = calibration.star_trackers
-    assert (first.frame, other.frame) == ('star_tracker', 'other')
-    assert (first.images, other.images) == (5, 5)
-    off = Rotation.from_quat(other.first_from_star_tracker_xyzw) * FIRST_FROM_OTHER.inv()
-    # Both have the attitudes of the one in the bag, so the noise of 10, 10 and 40 arcsec is
-    # common; five images each leave 18 arcsec, and 250 arcsec are assumed wrongly.
-    assert off.magnitude() < 80 * ARCSECOND_RAD
-    np.testing.assert_allclose(
-        first.star_tracker_from_camera_xyzw,
-        calibration.geometry.star_tracker_from_camera_xyzw,
-        atol=1e-15,
-    )
 
 
 @pytest.mark.slow

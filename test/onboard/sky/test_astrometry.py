@@ -14,7 +14,6 @@ from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND, SPEED_O
 from starcal_ros.sky.astrometry import (
     air_above,
     apparent_directions,
-    earth_velocity_c,
     SiteOptions,
     standard_pressure_hpa,
     through_the_air,
@@ -67,18 +66,6 @@ def test_directions_are_unit_vectors_and_each_star_stands_alone(stars):
     some = np.array([7, 3, 2000])
     assert np.array_equal(apparent_directions(stars.select(some), time_ns), every[some])
     assert apparent_directions(stars.select(slice(0)), time_ns).shape == (0, 3)
-
-
-def test_without_a_velocity_the_earths_is_used(stars):
-    time_ns = unix_ns(2030, 2, 3)
-    velocity_m_s = earth_velocity_c(time_ns) * SPEED_OF_LIGHT_M_S
-    assert np.linalg.norm(velocity_m_s) == pytest.approx(29.8e3, rel=0.02)
-    np.testing.assert_allclose(
-        apparent_directions(stars, time_ns),
-        apparent_directions(stars, time_ns, velocity_m_s),
-        rtol=0,
-        atol=1e-15,  # rounding
-    )
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from sample_sky import measured, QUIET, star_grid  # type: ignore[import-not-found]
+from sample_sky import corona, measured, QUIET, star_grid  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader
 from starcal_ground.simulation.rendering import expose, star_electrons
@@ -158,13 +158,9 @@ def test_the_gain_is_no_refuge_for_an_error_of_the_psf() -> None:
 
 
 def test_a_steep_sky_is_measured_in_small_cells() -> None:
-    v, u = np.mgrid[:1024, :960]
-    corona = 60000.0 / (1.0 + np.hypot(u + 100.0, v - 512.0) / 150.0) ** 2
-    electrons = np.random.default_rng(6).poisson(20.0 * (corona + 500.0))
-    pixels = np.rint(electrons / 20.0).astype(np.uint16)
-    small = measure_background(pixels).level_mesh
-    assert (sample_background(pixels).level_mesh == small).all()
-    flat = np.random.default_rng(7).normal(500.0, 5.0, pixels.shape).astype(np.uint16)
+    small = measure_background(corona()).level_mesh
+    assert (sample_background(corona()).level_mesh == small).all()
+    flat = np.random.default_rng(7).normal(500.0, 5.0, corona().shape).astype(np.uint16)
     assert sample_background(flat).level_mesh.size < small.size
 
 

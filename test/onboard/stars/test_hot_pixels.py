@@ -104,33 +104,26 @@ def test_hot_pixels_of_a_dark_frame() -> None:
 
 
 @pytest.mark.parametrize(
-    ('offset', 'before', 'after'),
+    ('offset', 'psf_px', 'before', 'after'),
     [
-        ((0.0, 0.0), StarRefusal.NONE, StarRefusal.HOT_PIXEL),  # in the core
-        ((1.0, -1.0), StarRefusal.NONE, StarRefusal.HOT_PIXEL),
+        ((0.0, 0.0), 1.0, StarRefusal.NONE, StarRefusal.HOT_PIXEL),  # in the core
+        ((1.0, -1.0), 1.0, StarRefusal.NONE, StarRefusal.HOT_PIXEL),
         # Beside it: the fit does without the pixel.
-        ((2.0, 0.0), StarRefusal.NONE, StarRefusal.NONE),
-        ((3.0, 3.0), StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),  # in the window, and the cause
-        ((6.0, 0.0), StarRefusal.ELONGATED, StarRefusal.ELONGATED),  # elsewhere
-        ((0.0, 0.0), StarRefusal.FAINT, StarRefusal.FAINT),  # it would be left out anyway
+        ((2.0, 0.0), 1.0, StarRefusal.NONE, StarRefusal.NONE),
+        # In the window, and the cause.
+        ((3.0, 3.0), 1.0, StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),
+        ((6.0, 0.0), 1.0, StarRefusal.ELONGATED, StarRefusal.ELONGATED),  # elsewhere
+        ((0.0, 0.0), 1.0, StarRefusal.FAINT, StarRefusal.FAINT),  # it would be left out anyway
+        # No pixel of a PSF of two pixels holds a twentieth of its light.
+        ((0.0, 0.0), 2.0, StarRefusal.NONE, StarRefusal.NONE),
+        ((0.0, 0.0), 2.0, StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),
     ],
 )
 def test_stars_on_hot_pixels(
-    offset: tuple[float, float], before: StarRefusal, after: StarRefusal
+    offset: tuple[float, float], psf_px: float, before: StarRefusal, after: StarRefusal
 ) -> None:
-    """A PSF of one pixel, fitted in a window of four pixels about the star."""
-    hot = np.array([50 * WIDTH + 70])
-    star = np.array([[70.0, 50.0]]) + offset
-    found = refuse_on_hot_pixels(star, np.array([before], np.uint8), hot, WIDTH, 4, 1.0)
+    """Fitted in a window of four pixels about a star of one pixel, seven about one of two."""
+    hot, star = np.array([50 * WIDTH + 70]), np.array([[70.0, 50.0]]) + offset
+    refusal, radius_px = np.array([before], np.uint8), round(1.0 + 3.0 * psf_px)
+    found = refuse_on_hot_pixels(star, refusal, hot, WIDTH, radius_px, psf_px)
     assert found.tolist() == [after]
-
-
-def test_a_wide_star_on_a_hot_pixel_does_without_it() -> None:
-    """No pixel of a PSF of two pixels holds a twentieth of its light."""
-    hot, star = np.array([50 * WIDTH + 70]), np.array([[70.0, 50.0]])
-    for refusal, expected in (
-        (StarRefusal.NONE, StarRefusal.NONE),
-        (StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),
-    ):
-        found = refuse_on_hot_pixels(star, np.array([refusal], np.uint8), hot, WIDTH, 7, 2.0)
-        assert found.tolist() == [expected]
