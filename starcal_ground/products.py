@@ -9,9 +9,10 @@ The folder holds ``residuals.npz`` and, in place of a calibration that failed,
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import contextlib
 from dataclasses import dataclass, field, fields, replace
+import hashlib
 import io
 import json
 import os
@@ -27,7 +28,7 @@ from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.errors import errors_as, ProductError
+from starcal_ros.errors import errors_as, OptionError, ProductError
 from starcal_ros.files import is_marked
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
@@ -331,3 +332,28 @@ def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
             if os.path.samestat(own, other.stat()):
                 return True
     return False
+
+
+def inputs_of(
+    files: Iterable[Path], is_stopped: Callable[[], bool] = lambda: False
+) -> dict[str, str]:
+    """
+    SHA-256 of the files that a calibration is made from, by their paths.
+
+    ``is_stopped`` is polled between blocks of 1 MB, so that another thread can stop it early; the
+    digests are then invalid.
+    """
+    digests = {}
+    for path in files:
+        digest = hashlib.sha256()
+        with errors_as(OptionError, path), untrusted.regular_file(path) as file:
+            while not is_stopped() and (block := file.read(1 << 20)):
+                digest.update(block)
+        digests[input_name(path)] = f'sha256:{digest.hexdigest()}'
+    return digests
+
+
+def input_name(path: Path) -> str:
+    """Name of an input file in a provenance, in Unicode whatever its bytes are."""
+    # Bytes that are not UTF-8 are written as Python writes them, \\xff.
+    return os.fsencode(path).decode(errors='backslashreplace')

@@ -6,8 +6,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from bench.frames import history, render_frame, write_set_up
+from starcal_ground.parameter_files import read_parameter_file
 from starcal_ground.simulation import scenario
-from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import StarObservations

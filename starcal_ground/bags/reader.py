@@ -39,7 +39,8 @@ import zlib
 import numpy as np
 
 from starcal_ground.bags import rosbag2
-from starcal_ros.errors import BagError, errors_as, ImageRefused, NotABag
+from starcal_ground.file_kinds import NotABag
+from starcal_ros.errors import BagError, errors_as, ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations

@@ -22,7 +22,6 @@ from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.messages.message_codec import offset_ns
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
@@ -60,7 +59,7 @@ def digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
     with ThreadPoolExecutor(1, 'digests') as thread:
         stopped = threading.Event()
         try:
-            yield thread.submit(solve.inputs_of, files, stopped.is_set).result
+            yield thread.submit(products.inputs_of, files, stopped.is_set).result
         finally:
             stopped.set()
 

@@ -209,7 +209,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'refused_images': Counter(calibration.images_refused).most_common(),
         'refused_stars': [*products.refused_stars(observations).items()],
         'model_sentences': verdict.model_sentences(calibration),
-        'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
+        'files': [(name, *products.inputs_of([folder / name]).values()) for name in written],
         'pictures': {one.time_ns: one for one in pictures if not one.is_expected},
         'options': _options(calibration),
     }

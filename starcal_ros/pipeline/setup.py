@@ -142,9 +142,6 @@ def check_prior_camera(camera: CameraModel, location: str) -> None:
         )
 
 
-NODES = ('star_observer', 'calibrator')
-
-
 @dataclass(frozen=True)
 class SetupOptions:
     """Prior camera and alignment, frames, catalog and detector frames."""
@@ -314,28 +311,6 @@ class CalibratorOptions:
 
 NODE_OPTION_CLASSES = (NodeOptions, ObserverOptions, CalibratorOptions)
 """Options that a parameter file may hold besides those of the processing stages."""
-
-
-def read_setup(params: Path) -> Setup:
-    """
-    Setup of a ROS parameter file, which may also set parameters of the nodes.
-
-    Raises as `load_setup`; the message on an option begins with the file.
-    """
-    values = read_values(params)
-    try:
-        return load_setup(values)
-    except OptionError as error:
-        raise OptionError(f'{params}: {error}') from error
-
-
-def read_values(params: Path) -> dict[str, object]:
-    """
-    Options of a ROS parameter file by name; relative paths are relative to that file.
-
-    Raises OptionError when it is not a parameter file.
-    """
-    return paths_from(options.read_parameter_file(params, NODES), params.parent)
 
 
 def paths_from(values: Mapping[str, object], folder: Path) -> dict[str, object]:

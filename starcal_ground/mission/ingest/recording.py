@@ -21,11 +21,11 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.reader import IMAGE_FILE
 from starcal_ground.images import image_series
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
+from starcal_ground.products import input_name
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.pipeline.solve import input_name
 from starcal_ros.records import Image, ORIGINAL, PIXELS_OF
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.untrusted import PARAMETER_BYTES

@@ -15,6 +15,8 @@ from sample_records import plain  # type: ignore[import-not-found]
 from tiny_campaign import ensemble, image, TRUTH, values  # type: ignore[import-not-found]
 from worlds import each_image  # type: ignore[import-not-found]
 
+from starcal_ground.campaign import ensemble_of
+from starcal_ground.products import inputs_of
 from starcal_ros.camera import PARAMETER_NAMES
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
@@ -26,7 +28,7 @@ from starcal_ros.formats.messages.record_messages import (
 from starcal_ros.options import names_of
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup, with_method
-from starcal_ros.pipeline.solve import inputs_of, provenance_of
+from starcal_ros.pipeline.solve import provenance_of
 from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image, StarObservations
 
 
@@ -70,7 +72,7 @@ def test_at_the_limit_an_image_goes_for_each_that_comes(camera_yaml: Path) -> No
     for observations in ensemble().images:
         collected = solve.add_to_ensemble(collected, observations, limited)
     stars = sorted(len(i) for i in ensemble().images)
-    for kept in (collected, solve.ensemble_of(ensemble().images, limited)):
+    for kept in (collected, ensemble_of(ensemble().images, limited)):
         assert len(kept.images) == 4
         assert min(len(i) for i in kept.images) > stars[2]
 
