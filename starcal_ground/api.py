@@ -17,7 +17,7 @@ import tempfile
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcal_ground import campaign
+from starcal_ground import campaign, written_files
 from starcal_ground.bags.topics import Topics
 from starcal_ground.images.first_setup import Given, source_of
 from starcal_ground.images.image_series import FileFacts
@@ -350,7 +350,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """
     path = Path(path)
     file = path / product_files.CALIBRATION_FILE if path.is_dir() else path
-    product_files.write_calibration(calibration, file)
+    written_files.write_calibration(calibration, file)
 
 
 def _unit(vectors: Floats) -> Floats:

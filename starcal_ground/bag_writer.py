@@ -13,9 +13,9 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 import yaml
 
+from starcal_ground.written_files import replacing
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError, errors_as
-from starcal_ros.files import replacing
 from starcal_ros.formats.bag import typestore as bag_types
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import sensor_messages

@@ -23,13 +23,14 @@ import zipfile
 import numpy as np
 import yaml
 
+from starcal_ground import written_files
 from starcal_ground.bags import rosbag2
+from starcal_ground.written_files import is_marked
 from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, OptionError, ProductError
-from starcal_ros.files import is_marked
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
 from starcal_ros.records import (
@@ -61,7 +62,7 @@ def write_products(
     calibration: Calibration, folder: Path, residuals: Residuals | None = None
 ) -> None:
     """Write a calibration, its camera and residuals, if given; raises ProductError."""
-    product_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
+    written_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
     name = calibration.provenance.get('camera_name', camera_yaml.DEFAULT_CAMERA_NAME)
     pixels_of = calibration.provenance.get(PIXELS_OF, '')
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name, pixels_of)
@@ -82,7 +83,7 @@ def write_camera_info(
     ``pixels_of`` says which pixels of image files are those of the camera, as a comment.
     """
     comment = f'# {PIXELS_OF}: {pixels_of}\n' if pixels_of else ''
-    product_files.write_atomically(path, comment + camera_info_text(camera, camera_name))
+    written_files.write_atomically(path, comment + camera_info_text(camera, camera_name))
 
 
 def camera_info_text(camera: CameraModel, camera_name: str) -> str:
@@ -158,7 +159,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
             np.save(file := io.BytesIO(), column, allow_pickle=False)
             # A name alone would get the time of the clock: each run writes the same bytes.
             archive.writestr(zipfile.ZipInfo(f'{name}.npy'), file.getvalue(), kind, 1)
-    product_files.write_atomically(path, memory.getvalue())
+    written_files.write_atomically(path, memory.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
@@ -229,7 +230,7 @@ def reasons_in_words(refused: Mapping[str, int]) -> str:
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """Write the record of a failure and remove earlier products; raises ProductError."""
     content = {'calibrated': False, **record_fields.json_object(record)}
-    product_files.write_atomically(
+    written_files.write_atomically(
         folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n'
     )
     for name in (product_files.CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):

@@ -11,7 +11,7 @@ import functools
 from pathlib import Path
 import threading
 
-from starcal_ground import campaign, products
+from starcal_ground import campaign, products, written_files
 from starcal_ground.bags import reader
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
@@ -21,7 +21,6 @@ from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.messages.message_codec import offset_ns
-from starcal_ros.formats.products import product_files
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 
@@ -113,7 +112,7 @@ def calibrate_into(
             with drawings.kind('report'):
                 page, report = _drawn(made, pictures, folder)
         if page:
-            product_files.write_atomically(path, page)
+            written_files.write_atomically(path, page)
         else:  # one that is there is of the products that were replaced
             path.unlink(missing_ok=True)
         written.result()

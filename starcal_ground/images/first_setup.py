@@ -33,10 +33,10 @@ from starcal_ground.campaign import Source, ThroughAir
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.photographs import image_paths, NOT_STATED
 from starcal_ground.products import make_folder, write_camera_info
+from starcal_ground.written_files import write_atomically
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.setup import files_of, load_setup, option_groups, paths_from, Setup
 from starcal_ros.records import Ensemble, OF_THE_STARS
 from starcal_ros.text import printable

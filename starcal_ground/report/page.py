@@ -20,7 +20,7 @@ import cv2
 import jinja2
 from markupsafe import Markup
 
-from starcal_ground import products
+from starcal_ground import products, written_files
 from starcal_ground.bags import reader
 from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
 from starcal_ground.report.thumbnails import Thumbnail
@@ -136,7 +136,7 @@ def write_report(folder: Path) -> Path:
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / products.REPORT_FILE
-    product_files.write_atomically(path, render(_read_folder(folder), folder))
+    written_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
 
@@ -244,7 +244,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     pictures = thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
     text = page_template('failure.html').render(record=record, pictures=pictures)
     path = folder / products.REPORT_FILE
-    product_files.write_atomically(path, text)
+    written_files.write_atomically(path, text)
     return path
 
 

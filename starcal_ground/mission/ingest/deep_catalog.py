@@ -23,10 +23,10 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcal_ground.mission.ingest.mission_records import Guard
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, IngestError, needing
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.robust_statistics import median
 from starcal_ros.sky import catalog as sky_catalog
 from starcal_ros.sky.catalog import MotionSource

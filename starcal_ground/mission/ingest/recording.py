@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import products
+from starcal_ground import products, written_files
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.reader import IMAGE_FILE
 from starcal_ground.images import image_series
@@ -170,9 +170,9 @@ def write_bag(
         trackers |= {f'/{frame}/attitude': other for frame, other in others.items()}
         _write_messages(writer, files, options, scale, guard, trackers, velocities, on_image)
         # Just before the bag replaces an older one; the record first, which marks it as ours.
-        product_files.write_atomically(record, json.dumps(content, indent=1) + '\n')
+        written_files.write_atomically(record, json.dumps(content, indent=1) + '\n')
         for path, text in prior_files.items():
-            product_files.write_atomically(path, text)
+            written_files.write_atomically(path, text)
     return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 
