@@ -20,11 +20,13 @@ from starcal_ros.formats.bag import typestore as bag_types
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.record_messages import observations_to_message
-from starcal_ros.records import Image, ORIGIN, StarObservations
+from starcal_ros.records import Image, StarObservations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+ORIGIN = 'starcal_origin'
+"""Metadata record of a bag with the entries of the provenance that the bag carries."""
 _OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
 
 

@@ -25,6 +25,7 @@ import yaml
 
 from starcal_ground import written_files
 from starcal_ground.bags import rosbag2
+from starcal_ground.bags.reader import OF_THE_STARS
 from starcal_ground.written_files import is_marked
 from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
@@ -38,7 +39,6 @@ from starcal_ros.records import (
     CameraGeometry,
     check_drawable,
     FOUND,
-    OF_THE_STARS,
     PIXELS_OF,
     StarObservations,
 )

@@ -38,6 +38,7 @@ import zlib
 
 import numpy as np
 
+from starcal_ground.bag_writer import ORIGIN
 from starcal_ground.bags import rosbag2
 from starcal_ground.file_kinds import NotABag
 from starcal_ros.errors import BagError, errors_as, ImageRefused
@@ -45,15 +46,9 @@ from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of, view_image
-from starcal_ros.records import Image, ORIGIN, ORIGINAL, PIXELS_OF, refused_image, StarObservations
+from starcal_ros.records import Image, ORIGINAL, PIXELS_OF, refused_image, StarObservations
 from starcal_ros.text import printable
-from starcal_ros.untrusted import (
-    ARCHIVE_BYTES,
-    METADATA_BYTES,
-    read_text,
-    regular_file,
-    yaml_value,
-)
+from starcal_ros.untrusted import ARCHIVE_BYTES, read_text, regular_file, yaml_value
 
 if not rosbag2.READS_BAGS:
     from mcap.data_stream import ReadDataStream
@@ -89,6 +84,9 @@ MAGIC = b'\x89MCAP0\r\n'
 _MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
 _SUFFIXES = ('.mcap', '.db3') if rosbag2.READS_BAGS else ('.mcap',)
 IMAGE_FILE = 'image file '  # start of keys of `ORIGIN`: the stamp of an image follows, ns
+OF_THE_STARS = '(stars)'
+"""In place of a star tracker in recordings: the attitude is that of the image's own stars."""
+METADATA_BYTES = 4 * 1024 * 1024  # 5000 topics
 OF_ANOTHER_BAG = ' (of another bag)'  # behind the name of a file that two bags have
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
 _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it

@@ -10,13 +10,14 @@ import re
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.frames import Frame, read_frames
+from starcal_ground.bags.reader import OF_THE_STARS
 from starcal_ground.bags.reader import Topics as Topics
 from starcal_ros.constants import CLOCKS_SET_NS, utc_text
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Image, OF_THE_STARS, StarObservations
+from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.text import counted
 
 _OF_A_STAR_TRACKER = (

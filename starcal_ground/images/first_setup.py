@@ -22,6 +22,7 @@ import numpy as np
 import yaml
 
 from starcal_ground.bags import reader
+from starcal_ground.bags.reader import OF_THE_STARS
 from starcal_ground.bags.topics import (
     choose_image_topic,
     choose_topics,
@@ -38,7 +39,7 @@ from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.pipeline.setup import files_of, load_setup, option_groups, paths_from, Setup
-from starcal_ros.records import Ensemble, OF_THE_STARS
+from starcal_ros.records import Ensemble
 from starcal_ros.text import printable
 
 PARAMETER_FILE, CAMERA_FILE = 'params.yaml', 'camera.yaml'

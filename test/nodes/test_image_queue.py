@@ -225,15 +225,22 @@ class Clock:
         return self.now_s
 
 
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Monotonic clock of the queue."""
+    clock = Clock()
+    monkeypatch.setattr('starcal_ros.ros.image_queue.time.monotonic', clock)
+    return clock
+
+
 def test_nothing_has_come() -> None:
-    recent = Recent(Clock())
+    recent = Recent()
     assert (recent.rate_hz(), recent.median(), recent.largest()) == (0.0, None, None)
 
 
-def test_rate_is_right_from_the_start() -> None:
+def test_rate_is_right_from_the_start(clock: Clock) -> None:
     """Before the window is full the rate is over the time since the start."""
-    clock = Clock()
-    recent = Recent(clock)
+    recent = Recent()
     for k in range(40):
         clock.now_s += 0.25
         recent.add(float(k))
@@ -241,9 +248,8 @@ def test_rate_is_right_from_the_start() -> None:
     assert (recent.median(), recent.largest()) == (19.5, 39.0)
 
 
-def test_what_is_old_is_forgotten() -> None:
-    clock = Clock()
-    recent = Recent(clock)
+def test_what_is_old_is_forgotten(clock: Clock) -> None:
+    recent = Recent()
     recent.add(1000.0)
     for k in range(1, 301):
         clock.now_s += 1.0
@@ -268,10 +274,9 @@ def test_what_is_old_is_forgotten() -> None:
     ],
 )
 def test_a_stream_has_ended_by_its_own_interval(
-    steps_s: list[float], silent_s: float, words: str
+    clock: Clock, steps_s: list[float], silent_s: float, words: str
 ) -> None:
-    clock = Clock()
-    arrivals = Arrivals(clock)
+    arrivals = Arrivals()
     assert not arrivals and not arrivals.ended(5.0)
     arrivals.add()
     for step_s in steps_s:

@@ -32,6 +32,8 @@ from starcal_ros.sky import catalog as sky_catalog
 from starcal_ros.sky.catalog import MotionSource
 from starcal_ros.untrusted import regular_file, shown
 
+UNMOVED = (MotionSource.UNKNOWN, MotionSource.UNKNOWN_J2000)
+
 
 def johnson_v(g: Floats, bp_rp: Floats) -> Floats:
     """V from G and BP - RP, Gaia DR3 documentation section 5.5.1; without a colour, G + 0.15."""
@@ -186,7 +188,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
     pairs = close_pairs(_direction(values))
     values['close_pair'] = marked_close(pairs, values['magnitude'])
     values['close_pair'][int(new.sum()) :] |= bundled.close_pair[kept]
-    unmoved = np.isin(stars['motion_source'], sky_catalog.UNMOVED)
+    unmoved = np.isin(stars['motion_source'], UNMOVED)
     return DeepCatalog(
         integer_columns(values),
         table.source,
