@@ -76,21 +76,9 @@ if not TYPE_CHECKING:  # a checker sees the imports above, and no other names
         'records': ('Calibration', 'CameraGeometry', 'StarObservations'),
     }
     _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
-    # They were here in 1.0.0.  An AttributeError's text would not reach a `from ... import`.
-    _ON_GROUND = frozenset(
-        [
-            'calibrate',
-            'calibrate_bag',
-            'calibrate_with_residuals',
-            'observations_of',
-            'write_calibration',
-        ]
-    )
 
     def __getattr__(name: str) -> object:
         """Import a public name at its first use (PEP 562)."""
-        if name in _ON_GROUND:
-            raise ImportError(f'starcal_ros.{name} is starcal_ground.{name} now')
         if name not in __all__:
             raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
         if name == '__version__':

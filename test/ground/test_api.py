@@ -51,21 +51,6 @@ def test_public_names_are_those_that_can_be_imported() -> None:
     assert starcal_ros.__version__.count('.') == 2
 
 
-@pytest.mark.parametrize(
-    'name',
-    [
-        'calibrate',
-        'calibrate_bag',
-        'calibrate_with_residuals',
-        'observations_of',
-        'write_calibration',
-    ],
-)
-def test_an_old_name_leads_to_the_new_one(name) -> None:
-    with pytest.raises(ImportError, match=f'^starcal_ros.{name} is starcal_ground.{name} now$'):
-        exec(f'from starcal_ros import {name}')
-
-
 @pytest.mark.slow
 def test_arrays_give_the_estimate_of_the_records() -> None:
     images = [
