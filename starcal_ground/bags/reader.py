@@ -118,12 +118,12 @@ def read_summary(file: Path) -> Summary | None:
             return None
 
 
-def origin_of(paths: Iterable[Path | str]) -> tuple[str, dict[str, str]]:
+def origin_of(paths: Iterable[Path | str]) -> dict[str, str]:
     """
-    Pixels of image files that bags were made of, and the SHA-256 of their files by name.
+    Entries of the provenance on the image files that bags were made of.
 
-    Both are empty for a bag that does not state them, as a recorded one.  Raises BagError as
-    `mcap_files`.
+    Which of their pixels, and the SHA-256 of each; empty for a bag that does not state them, as a
+    recorded one.  Raises BagError as `mcap_files`.
     """
     pixels_of: dict[str, None] = {}
     originals: dict[str, str] = {}
@@ -133,10 +133,10 @@ def origin_of(paths: Iterable[Path | str]) -> tuple[str, dict[str, str]]:
             if name == PIXELS_OF:
                 pixels_of[text] = None
             elif name.startswith(ORIGINAL):
-                name = name.removeprefix(ORIGINAL)
                 while originals.setdefault(name, text) != text:
                     name += OF_ANOTHER_BAG
-    return '; '.join(pixels_of), originals
+    origin = {PIXELS_OF: '; '.join(pixels_of)} if pixels_of else {}
+    return origin | originals
 
 
 def image_files(paths: Iterable[Path | str], offset_ns: int = 0) -> dict[int, str]:

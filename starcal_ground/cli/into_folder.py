@@ -22,7 +22,7 @@ from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.messages.message_codec import offset_ns
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, ORIGINAL, PIXELS_OF, StarObservations
 
 
 def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
@@ -148,7 +148,12 @@ def _origin_of(source: campaign.Source) -> dict[str, str]:
     """Metadata of the observations: files that the bags, and each image, were made from."""
     offset_s = source.setup.attitude.stamp_offset_s if source.topics.image else 0.0
     names = reader.image_files(source.bags, offset_ns(offset_s))
-    return source.setup.origin | {f'{reader.IMAGE_FILE}{k}': name for k, name in names.items()}
+    of_files = {
+        key: words
+        for key, words in source.setup.origin.items()
+        if key == PIXELS_OF or key.startswith(ORIGINAL)
+    }
+    return of_files | {f'{reader.IMAGE_FILE}{k}': name for k, name in names.items()}
 
 
 def _write_observations(

@@ -29,7 +29,7 @@ from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import annotation, solve
+from starcal_ros.pipeline import annotation
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import (
     Calibration,
@@ -37,6 +37,7 @@ from starcal_ros.records import (
     PIXELS_OF,
     STAR_REFUSALS,
     StarObservations,
+    TIMES,
     TOTAL,
 )
 from starcal_ros.text import significant
@@ -190,7 +191,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     ]
     return {
         'calibration': calibration,
-        'times_of': calibration.provenance.get(solve.TIMES, ''),
+        'times_of': calibration.provenance.get(TIMES, ''),
         'pixels_of': calibration.provenance.get(PIXELS_OF, ''),
         'parameters': verdict.parameter_rows(calibration, prior),
         'alignment': verdict.alignment_rows(calibration, prior),

@@ -39,12 +39,10 @@ from starcal_ros.records import (
     Ensemble,
     EnsembleStatus,
     factored_field,
-    FOUND,
     StarObservations,
+    TIMES,
 )
 
-TIMES = 'image times'
-"""Key of the provenance: where the stamps are from, if the images state none."""
 _FEWEST_STARS = 3  # two fit their mirror image
 _SHOWING = 50  # stars, from bright to faint, show the constellation as well as all
 _MOST_OFF = 0.5  # misfit in RMS sizes of a constellation; a mirrored one misfits by 1.4
@@ -189,6 +187,7 @@ def _not_judged(
     )
     stamps_ns = [image.time_ns for image in ensemble.images]
     budget = sigma_budget(result, setup.calibration, has_alignment=setup.has_tracker)
+    has_dates = TIMES not in setup.origin
     return Calibration(
         time_ns=max(stamps_ns),
         first_image_ns=min(stamps_ns),
@@ -234,7 +233,7 @@ def _not_judged(
         ),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=budget,
-        statements=statements(budget, result, setup.calibration, has_dates=not setup.times_of),
+        statements=statements(budget, result, setup.calibration, has_dates=has_dates),
     )
 
 
@@ -326,8 +325,6 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'options': json.dumps(setup.options(), sort_keys=True),
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': _digest(ensemble),
-        **({TIMES: setup.times_of} if setup.times_of else {}),
-        **({FOUND: ', '.join(setup.found)} if setup.found else {}),
         **setup.origin,
         **{f'input {name}': value for name, value in inputs.items()},
     }

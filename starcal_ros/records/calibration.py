@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 TOTAL = 'total'
+TIMES = 'image times'
+"""Key of the provenance: where the stamps are from, if the images state none."""
 PIXELS_OF = 'image pixels'
 """Key of the provenance: which pixels of image files are those of the camera, if not all."""
 FOUND = 'found by the stars'
