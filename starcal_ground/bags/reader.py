@@ -22,7 +22,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import functools
 import io
 import itertools
@@ -180,9 +180,27 @@ def _lacks_checksum(stream: IO[bytes]) -> bool:
         return False
 
 
+@dataclass(frozen=True)
+class RecordedMessage(RawMessage):
+    """
+    A message of a bag; ``definition`` is that of its type there, empty for that of this version.
+
+    ``place`` is its file, the offset of its chunk there, or its own, and its number in the chunk;
+    None where the reader has none.
+    """
+
+    definition: str = ''
+    place: tuple[Path, int, int] | None = field(default=None, compare=False)
+
+    @property
+    def data(self) -> bytes:
+        """A copy of the message as bytes, because middleware does not accept a view."""
+        return bytes(self.view)
+
+
 def read_messages(
     file: Path, wanted: frozenset[Wanted] | None, on_damage: Damage
-) -> Iterator[RawMessage]:
+) -> Iterator[RecordedMessage]:
     """Intact messages that are wanted (None: all), in file order (rosbag2: in its own)."""
     if rosbag2.READS_BAGS:
         types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
@@ -190,7 +208,7 @@ def read_messages(
             if data[:4] == _ZSTD:
                 what = 'its messages are compressed one by one, which rosbag2 leaves'
                 raise BagError(f'{file}: {what}: {rosbag2.INSTALL}')
-            yield RawMessage(topic, types[topic], '', log_time_ns, memoryview(data))
+            yield RecordedMessage(topic, types[topic], log_time_ns, memoryview(data))
         return
     summary = read_summary(file)
     known = summary or Summary()
@@ -217,8 +235,8 @@ def read_messages(
                     is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
                     texts[schema.id] = schema.data.decode(errors='replace') if is_text else ''
                 view, text = memoryview(_message(record.data)), texts[schema.id]
-                yield RawMessage(
-                    channel.topic, schema.name, text, record.log_time, view, (file, *place)
+                yield RecordedMessage(
+                    channel.topic, schema.name, record.log_time, view, text, (file, *place)
                 )
     if summary is None and pieces.complete:
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
@@ -608,7 +626,7 @@ def read_raw(
     paths: Iterable[Path | str],
     only: Iterable[Wanted] | None = None,
     on_damage: Damage = log_damage,
-) -> Iterator[RawMessage]:
+) -> Iterator[RecordedMessage]:
     """Serialised messages of the given topics, or of types on them (None: all), in file order."""
     wanted = None if only is None else frozenset(only)
     for file in mcap_files(paths):
@@ -617,7 +635,7 @@ def read_raw(
 
 def by_stamp(
     paths: Iterable[Path | str], images: Iterable[Wanted], start: int = 0
-) -> Iterator[RawMessage]:
+) -> Iterator[RecordedMessage]:
     """
     Serialised images in the order of their stamps, without the first ones in file order.
 
@@ -638,7 +656,9 @@ def by_stamp(
         chunks = dict([*chunks.items(), ((file, offset), chunk)][-2:])
         record = chunk[number]
         assert isinstance(record, McapMessage)  # as when its place was found
-        yield RawMessage(*kind, log_time_ns, memoryview(_message(record.data)), place)
+        topic, type_name, definition = kind
+        view = memoryview(_message(record.data))
+        yield RecordedMessage(topic, type_name, log_time_ns, view, definition, place)
 
 
 def image_stamp_ns(raw: RawMessage) -> int:
@@ -697,7 +717,7 @@ def read_observations(
             yield refused_image(time_ns, 0, 0, 'bad_observations', str(error))
 
 
-def decode(raw: RawMessage) -> Message:
+def decode(raw: RecordedMessage) -> Message:
     """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
     try:
         if rosbag2.READS_BAGS:
@@ -709,7 +729,7 @@ def decode(raw: RawMessage) -> Message:
         raise _undecodable(raw, error) from error
 
 
-def cdr_of_this_version(raw: RawMessage) -> bytes:
+def cdr_of_this_version(raw: RecordedMessage) -> bytes:
     """
     Bytes of a message for ROS, whose definition is that of this version; raises BagError.
 
