@@ -14,12 +14,13 @@ import contextlib
 import hashlib
 import os
 from pathlib import Path
-from typing import IO
+from typing import IO, TYPE_CHECKING
 
 from starcal_ros import files
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.formats.products.product_files import calibration_text
-from starcal_ros.records import Calibration
+
+if TYPE_CHECKING:
+    from starcal_ros.records import Calibration
 
 _MARK = 'user.starcal.sha256'
 
@@ -46,6 +47,9 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
     """Write ``calibration.json``, NaN and infinity as null; raises ProductError if it cannot."""
+    # The help of the tool imports this module, and needs no numerics.
+    from starcal_ros.formats.products.product_files import calibration_text
+
     write_atomically(path, calibration_text(calibration))
 
 

@@ -68,6 +68,10 @@ class IngestError(StarcalError):
     """A file of a mission cannot be read; the text names file, cause and remedy."""
 
 
+class NotFromStars(StarcalError):
+    """Images without attitudes give no camera; the text names the images to take next."""
+
+
 class ArchiveError(StarcalError):
     """The state folder cannot be used or cannot be written at present."""
 

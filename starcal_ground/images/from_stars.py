@@ -27,7 +27,7 @@ from starcal_ground.images import copies
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
 from starcal_ros.camera.lens import ideal_points, LENSES
-from starcal_ros.errors import StarcalError
+from starcal_ros.errors import NotFromStars
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import State
@@ -68,10 +68,6 @@ _ROBUST_SCALE, _ROBUST_GAIN = 3.0, 0.1  # as in the first search of the estimate
 _FREE_ARCSEC = 7200.0  # free rotations: at 20 arcsec those of single images bent the camera
 _FEWEST_STARS, _MORE_STARS = 30, 1.02  # in all images; growth to match them again
 _SIGMA_ARCSEC = 60.0  # 1-sigma of the rotations, more than refraction and aberration change them
-
-
-class NotFromStars(StarcalError):
-    """Images without attitudes give no camera; the text names the images to take next."""
 
 
 @dataclass(frozen=True)

@@ -28,13 +28,13 @@ from starcal_ground.diagnosis.bags import refusals
 from starcal_ground.images import from_stars as by_stars
 from starcal_ground.images import photographs as image_files
 from starcal_ground.images import stated as stated_facts
-from starcal_ground.images.from_stars import NotFromStars
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ground.mirror import MIRRORED, mirrored
 from starcal_ground.products import input_name
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import CLOCKS_SET_NS
+from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.setup import load_setup, option_groups

@@ -32,8 +32,7 @@ from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import print_table, print_text, print_verdict, print_wrapped
-from starcal_ground.images.from_stars import NotFromStars
-from starcal_ros.errors import OptionError
+from starcal_ros.errors import NotFromStars, OptionError
 from starcal_ros.text import significant
 
 if TYPE_CHECKING:

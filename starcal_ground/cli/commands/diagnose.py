@@ -29,9 +29,8 @@ import tempfile
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.images.from_stars import NotFromStars
 from starcal_ros.constants import utc_text
-from starcal_ros.errors import BagError, OptionError
+from starcal_ros.errors import BagError, NotFromStars, OptionError
 from starcal_ros.text import counted, significant
 
 if TYPE_CHECKING:

@@ -30,7 +30,6 @@ from starcal_ground.images.from_stars import (
     from_stars,
     FromStars,
     ideal_camera,
-    NotFromStars,
 )
 from starcal_ground.images.night_sky import (
     _set_up,
@@ -44,6 +43,7 @@ import starcal_ros
 from starcal_ros.arrays import Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Image, PIXELS_OF, refused_image, TIMES
 from starcal_ros.sky.astrometry import SiteOptions
