@@ -31,8 +31,10 @@ from bench.trials import bound_arcsec, Score, without_last
 from docs import make_evidence
 from starcal_ground import campaign
 from starcal_ground.bags import reader
+from starcal_ground.campaign import ensemble_of
 from starcal_ground.cli.arguments import number
 from starcal_ground.images.first_setup import air_of
+from starcal_ground.parameter_files import read_values
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation.centroids import scenario_information
 from starcal_ros.arrays import Floats
@@ -47,8 +49,8 @@ from starcal_ros.camera import (
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
-from starcal_ros.pipeline.setup import load_setup, read_values, Setup
-from starcal_ros.pipeline.solve import ensemble_of, solve
+from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import Calibration
 from studies import missions, rendered_worlds, worlds
 from studies.trials import rms

@@ -11,13 +11,13 @@ import tempfile
 import yaml
 
 from starcal_ground.bag_writer import BagWriter
+from starcal_ground.parameter_files import read_parameter_file
 from starcal_ground.products import write_camera_info
 from starcal_ground.simulation import rendering, simulated_bag
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
-from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe, solve
 from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import AttitudeSample, Ensemble, Image

@@ -22,8 +22,8 @@ from scipy.special import erf
 
 from bench.table import Table
 from starcal_ground.report import page, svg
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Floats
-from starcal_ros.formats.products.product_files import write_atomically
 from studies.trials import rms
 
 FILE = Path(__file__).parent / 'evidence.md'

@@ -23,6 +23,7 @@ from PIL.PngImagePlugin import PngInfo
 import yaml
 
 from starcal_ground.cli import main as cli
+from starcal_ground.parameter_files import read_parameter_file
 from starcal_ground.products import write_camera_info
 from starcal_ground.report.detector_figures import (
     cell_counts,
@@ -38,7 +39,6 @@ from starcal_ros.arrays import Floats, Picture
 from starcal_ros.assessment.observability import coverage
 from starcal_ros.camera import distortion_px, pixel_grid
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe as observing
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.annotation import annotate_reduced

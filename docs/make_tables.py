@@ -18,8 +18,8 @@ import textwrap
 from typing import Any
 
 from starcal_ground.bags.player_options import PlayerOptions
+from starcal_ground.fits_keywords import FACTS
 from starcal_ground.mission.export.export_formats import FORMATS
-from starcal_ros.formats.fits_keywords import FACTS
 from starcal_ros.pipeline.setup import (
     CalibratorOptions,
     NODE_OPTION_CLASSES,

@@ -17,10 +17,12 @@ import tempfile
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from starcal_ground import campaign
+from starcal_ground import campaign, written_files
 from starcal_ground.bags.topics import Topics
 from starcal_ground.images.first_setup import Given, source_of
 from starcal_ground.images.image_series import FileFacts
+from starcal_ground.parameter_files import read_values
+from starcal_ground.products import inputs_of
 from starcal_ground.source_diagnosis import calibrated
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
@@ -31,8 +33,7 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.products import product_files
 from starcal_ros.options import names_of, unknown_option
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.setup import load_setup, read_values
-from starcal_ros.pipeline.solve import inputs_of
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
 from starcal_ros.records import Calibration, CameraGeometry, StarObservations
 
@@ -222,7 +223,7 @@ def calibrate_with_residuals(
     setup = load_setup(options, prior=prior)
     # The caller has looked the stars up: the bundled catalog has no part in the result.
     none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')
-    setup, ensemble = dataclasses.replace(setup, catalog=none), solve.ensemble_of(images, setup)
+    setup, ensemble = dataclasses.replace(setup, catalog=none), campaign.ensemble_of(images, setup)
     return solve.solve_with_residuals(ensemble, setup)
 
 
@@ -349,7 +350,7 @@ def write_calibration(calibration: Calibration, path: Path | str) -> None:
     """
     path = Path(path)
     file = path / product_files.CALIBRATION_FILE if path.is_dir() else path
-    product_files.write_calibration(calibration, file)
+    written_files.write_calibration(calibration, file)
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -13,18 +13,20 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 import yaml
 
+from starcal_ground.written_files import replacing
 from starcal_ros.arrays import Floats
 from starcal_ros.errors import BagError, errors_as
-from starcal_ros.files import replacing
 from starcal_ros.formats.bag import typestore as bag_types
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.formats.messages.record_messages import observations_to_message
-from starcal_ros.records import Image, ORIGIN, StarObservations
+from starcal_ros.records import Image, StarObservations
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+ORIGIN = 'starcal_origin'
+"""Metadata record of a bag with the entries of the provenance that the bag carries."""
 _OF_BAGS = ('metadata.yaml', '*.mcap', '*.db3')
 
 

@@ -11,7 +11,7 @@ that match no star they keep the last few only.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import contextlib
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -226,7 +226,7 @@ def _measured_again(
 
 def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
     setup, observations = observed.source.setup, _with_repeats(observed.observations)
-    ensemble = solve.ensemble_of(observations, setup)
+    ensemble = ensemble_of(observations, setup)
     calibration, residuals = solve.solve_with_residuals(ensemble, setup, inputs)
     notes = (*observed.notes, *_refusals(observations))
     return Campaign(setup, observations, ensemble, calibration, residuals, notes)
@@ -257,3 +257,18 @@ def _refusals(observations: Sequence[StarObservations]) -> Iterator[str]:
             detail = f' ({group.detail})' if group.detail else ''
             count = f'{group.count} of {counted(len(observations), "image")}'
             yield f'{count} refused, {group.reason}: {group.meaning}{detail}'
+
+
+def ensemble_of(observations: Iterable[StarObservations], setup: Setup) -> Ensemble:
+    """
+    The ensemble of some images, each checked as by `solve.checked`.
+
+    The least informative are dropped once there are twice as many as are kept, and at the end: to
+    weigh all images again for each further one would take longer than to measure it.
+    """
+    ensemble = Ensemble()
+    for image in observations:
+        ensemble = ensemble.add(solve.checked(image, setup))
+        if len(ensemble.images) >= 2 * setup.calibration.max_images:
+            ensemble = solve.within_limit(ensemble, setup)
+    return solve.within_limit(ensemble, setup)

@@ -9,7 +9,7 @@ import glob
 from pathlib import Path
 import shlex
 
-from starcal_ros.errors import IngestError, NotABag, StarcalError
+from starcal_ros.errors import BagError, IngestError, StarcalError
 from starcal_ros.formats.image_files import is_fits
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.untrusted import regular_file
@@ -72,6 +72,14 @@ _MAGIC: tuple[tuple[int, bytes, FileKind], ...] = (
 # Camera raw has the first bytes of a TIFF in these, whose first image is a preview.
 _RAW_ENDINGS = ('.dng', '.nef', '.nrw', '.arw', '.sr2', '.pef', '.srw', '.3fr', '.iiq', '.raw')
 _BMP_RESERVED = slice(6, 10)
+
+
+class NotABag(BagError):
+    """A file or folder, ``place``, is no MCAP bag."""
+
+    def __init__(self, text: str, place: Path) -> None:
+        super().__init__(text)
+        self.place = place
 
 
 def kind_of(path: Path) -> FileKind:

@@ -9,9 +9,10 @@ The folder holds ``residuals.npz`` and, in place of a calibration that failed,
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 import contextlib
 from dataclasses import dataclass, field, fields, replace
+import hashlib
 import io
 import json
 import os
@@ -22,13 +23,15 @@ import zipfile
 import numpy as np
 import yaml
 
+from starcal_ground import written_files
 from starcal_ground.bags import rosbag2
+from starcal_ground.bags.reader import OF_THE_STARS
+from starcal_ground.written_files import is_marked
 from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
-from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import is_marked
+from starcal_ros.errors import errors_as, OptionError, ProductError
 from starcal_ros.formats.messages.record_messages import camera_info_fields
 from starcal_ros.formats.products import camera_yaml, product_files
 from starcal_ros.records import (
@@ -36,7 +39,6 @@ from starcal_ros.records import (
     CameraGeometry,
     check_drawable,
     FOUND,
-    OF_THE_STARS,
     PIXELS_OF,
     StarObservations,
 )
@@ -60,7 +62,7 @@ def write_products(
     calibration: Calibration, folder: Path, residuals: Residuals | None = None
 ) -> None:
     """Write a calibration, its camera and residuals, if given; raises ProductError."""
-    product_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
+    written_files.write_calibration(calibration, folder / product_files.CALIBRATION_FILE)
     name = calibration.provenance.get('camera_name', camera_yaml.DEFAULT_CAMERA_NAME)
     pixels_of = calibration.provenance.get(PIXELS_OF, '')
     write_camera_info(calibration.geometry.camera, folder / CAMERA_INFO_FILE, name, pixels_of)
@@ -81,7 +83,7 @@ def write_camera_info(
     ``pixels_of`` says which pixels of image files are those of the camera, as a comment.
     """
     comment = f'# {PIXELS_OF}: {pixels_of}\n' if pixels_of else ''
-    product_files.write_atomically(path, comment + camera_info_text(camera, camera_name))
+    written_files.write_atomically(path, comment + camera_info_text(camera, camera_name))
 
 
 def camera_info_text(camera: CameraModel, camera_name: str) -> str:
@@ -157,7 +159,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
             np.save(file := io.BytesIO(), column, allow_pickle=False)
             # A name alone would get the time of the clock: each run writes the same bytes.
             archive.writestr(zipfile.ZipInfo(f'{name}.npy'), file.getvalue(), kind, 1)
-    product_files.write_atomically(path, memory.getvalue())
+    written_files.write_atomically(path, memory.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
@@ -228,7 +230,7 @@ def reasons_in_words(refused: Mapping[str, int]) -> str:
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """Write the record of a failure and remove earlier products; raises ProductError."""
     content = {'calibrated': False, **record_fields.json_object(record)}
-    product_files.write_atomically(
+    written_files.write_atomically(
         folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n'
     )
     for name in (product_files.CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
@@ -331,3 +333,28 @@ def same_as_one_of(path: Path, others: Iterable[Path]) -> bool:
             if os.path.samestat(own, other.stat()):
                 return True
     return False
+
+
+def inputs_of(
+    files: Iterable[Path], is_stopped: Callable[[], bool] = lambda: False
+) -> dict[str, str]:
+    """
+    SHA-256 of the files that a calibration is made from, by their paths.
+
+    ``is_stopped`` is polled between blocks of 1 MB, so that another thread can stop it early; the
+    digests are then invalid.
+    """
+    digests = {}
+    for path in files:
+        digest = hashlib.sha256()
+        with errors_as(OptionError, path), untrusted.regular_file(path) as file:
+            while not is_stopped() and (block := file.read(1 << 20)):
+                digest.update(block)
+        digests[input_name(path)] = f'sha256:{digest.hexdigest()}'
+    return digests
+
+
+def input_name(path: Path) -> str:
+    """Name of an input file in a provenance, in Unicode whatever its bytes are."""
+    # Bytes that are not UTF-8 are written as Python writes them, \\xff.
+    return os.fsencode(path).decode(errors='backslashreplace')

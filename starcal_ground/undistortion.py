@@ -15,12 +15,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from starcal_ground.fits_images import read_fits
 from starcal_ground.mirror import flips_in, mirrored
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Singles
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.errors import IngestError
-from starcal_ros.formats.image_files import content_of, decoded, is_fits, read_fits
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ros.formats.image_files import content_of, decoded, is_fits
 from starcal_ros.records import Calibration, PIXELS_OF
 
 _ROWS = 128  # rows of a map made at once: those of 5 megapixels together take a gigabyte

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 import contextlib
-from pathlib import Path
 import sys
 
 # Modules of the extras in setup.cfg.
@@ -59,14 +58,6 @@ class CatalogError(StarcalError):
 
 class BagError(StarcalError):
     """A bag is missing, not an MCAP bag, or lacks the requested topic."""
-
-
-class NotABag(BagError):
-    """A file or folder, ``place``, is no MCAP bag; `starcal` says what it is and what helps."""
-
-    def __init__(self, text: str, place: Path) -> None:
-        super().__init__(text)
-        self.place = place
 
 
 class ProductError(StarcalError):

@@ -4,8 +4,8 @@ Options: dataclass fields with a description, a unit and a range; reading of par
 
 Each stage has a frozen options dataclass beside the function that it tunes.  ROS parameters, the
 parameter file and the documentation are generated from the fields made with `option`.  The tool
-reads them from a parameter file (`pipeline.setup.read_setup`); a node declares them as parameters
-(`ros.parameters.OptionParameters`) and gives their values to `load_setup`.
+reads them from a parameter file, a node declares them as parameters
+(`ros.parameters.OptionParameters`); both give their values to `pipeline.setup.load_setup`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,6 @@ _MOST_CHARACTERS = 4096  # Linux has no longer path
 _MOST_ITEMS = 100  # the longest list in use has 22 numbers
 _LONGEST_NAME = 100
 _LONGEST_SECTION = 255  # ROS allows no longer name of a topic or node
-_OF_CAMERAS = {'image_width', 'camera_matrix', 'cam0'}  # ROS, OpenCV, kalibr
 _ALMOST = 0.85  # similarity of names from which one is taken for the other, misspelt
 
 
@@ -116,59 +115,6 @@ def from_mapping(cls: type[OptionsT], values: Mapping[str, object]) -> OptionsT:
     """Options from the entries of a mapping that match the fields; raises OptionError."""
     given = [field for field in option_fields(cls) if field.name in values]
     return cls(**{field.name: check_value(field, values[field.name]) for field in given})
-
-
-def read_parameter_file(path: Path, nodes: tuple[str, ...]) -> dict[str, object]:
-    """
-    Parameters of a ROS 2 parameter file that apply to any of the named nodes.
-
-    Sections apply as in ROS, later ones winning: ``/**``, ``/**/NODE`` and ``NODE``; those with
-    other wildcards are not read.
-
-    Raises OptionError when the file cannot be read or is not a ROS parameter file, or has a
-    section that seems meant for one of the nodes and applies to none.
-    """
-    values: dict[str, object] = {}
-    sections = parameter_sections(path)
-    applied = [
-        name
-        for name in sections
-        if any(section_applies(name, f'/{node}') for node in ('', *nodes))
-    ]
-    named = {meant_node(name, nodes) for name in applied}
-    for name in sections:
-        meant = meant_node(name, nodes)
-        if meant and meant not in named:
-            raise OptionError(f'{path}: section {shown(name)} is not read: write /**/{meant}')
-    of_nodes = {
-        name
-        for name, body in sections.items()
-        if isinstance(body, dict) and 'ros__parameters' in body
-    }
-    if cameras := (_OF_CAMERAS & {*sections}) - of_nodes:
-        raise OptionError(
-            f'{path}: a camera file ({min(cameras)}), not a parameter file: give it as'
-            f' camera_info_url in one, or --set camera_info_url={path}'
-        )
-    values_only = [name for name, body in sections.items() if not isinstance(body, dict)]
-    if not applied and (values_only or 'ros__parameters' in sections):
-        above = '/**:' if 'ros__parameters' in sections else '/**: and ros__parameters:'
-        raise OptionError(
-            f'{path}: parameters in no section of a node: write {above} above them, and indent'
-            ' them below'
-        )
-    if not applied:
-        there = ', '.join(sections)
-        raise OptionError(
-            f'{path}: not a parameter file for this: no section /**, {" or ".join(nodes)}, '
-            f'only {there[:80]}'
-        )
-    for name in applied:
-        body = sections[name]
-        if not isinstance(body, dict) or not isinstance(body.get('ros__parameters'), dict):
-            raise OptionError(f'{path}: section {shown(name)} has no ros__parameters')
-        values.update(body['ros__parameters'])
-    return values
 
 
 def parameter_sections(path: Path) -> dict[str, object]:

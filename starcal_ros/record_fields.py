@@ -210,17 +210,11 @@ class Record:
 
     def __repr__(self) -> str:
         """Return name and fields in three lines."""
-        text = f'{type(self).__name__}({", ".join(self._in_words())})'
+        names = (field.name for field in dataclasses.fields(self))  # type: ignore[arg-type]
+        words = ', '.join(f'{name}={_in_short(getattr(self, name))}' for name in names)
+        text = f'{type(self).__name__}({words})'
         indent, end = {'subsequent_indent': '  '}, {'max_lines': _LINES, 'placeholder': ' ...)'}
         return '\n'.join(textwrap.wrap(text, _WIDTH, **indent, **end))  # type: ignore[arg-type]
-
-    def summary(self) -> str:
-        """Text with a line for each field; arrays and lists by their size."""
-        return '\n  '.join([type(self).__name__, *self._in_words()])
-
-    def _in_words(self) -> list[str]:
-        fields = dataclasses.fields(self)  # type: ignore[arg-type]
-        return [f'{field.name}={_in_short(getattr(self, field.name))}' for field in fields]
 
 
 def _is_equal(a: Any, b: Any) -> bool:

@@ -28,7 +28,6 @@ import zipfile
 import yaml
 
 PARAMETER_BYTES = 256 * 1024  # parameter or camera file: thirty times the longest in use
-METADATA_BYTES = 4 * 1024 * 1024  # 5000 topics
 PRODUCT_BYTES = 8 * 1024 * 1024  # a calibration.json with the covariance of a field has 1 MB
 ARCHIVE_BYTES = 1 << 30  # catalog, residuals or message, inflated: 30 million stars
 

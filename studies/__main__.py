@@ -21,10 +21,10 @@ from starcal_ground.cli import terminal
 from starcal_ground.cli.arguments import number
 from starcal_ground.products import make_folder
 from starcal_ground.simulation.scenario import scenario
+from starcal_ground.written_files import write_atomically
 from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS
-from starcal_ros.formats.products.product_files import write_atomically
 from studies import monte_carlo, paper
 from studies.monte_carlo import Design, Row
 from studies.workers import processors, run_each

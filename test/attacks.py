@@ -21,9 +21,10 @@ from hypothesis import strategies as st
 
 from starcal_ground.bags import reader, topics
 from starcal_ground.bags.reader import Topics
+from starcal_ground.parameter_files import read_setup
 from starcal_ground.products import write_observations, write_products
 from starcal_ros.pipeline import solve
-from starcal_ros.pipeline.setup import read_setup, Setup
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Calibration, Ensemble, StarObservations
 
 BAG = Path(__file__).parents[1] / 'bags' / 'tiny'

@@ -17,9 +17,9 @@ from vehicle import BOTH, Client, NodeProcess, Vehicle  # type: ignore[import-no
 from bench.frames import history, render_frame, write_set_up
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.bag_writer import attitude_to_message, image_to_message
+from starcal_ground.parameter_files import read_parameter_file
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
-from starcal_ros.options import read_parameter_file
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.ros.node import make_message

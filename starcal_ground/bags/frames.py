@@ -27,7 +27,6 @@ from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.formats.messages import message_codec, sensor_messages
-from starcal_ros.formats.messages.message_codec import RawMessage
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.attitude import ARC_S, attitude_sample, AttitudeHistory, AttitudeOptions
 from starcal_ros.text import counted
@@ -74,7 +73,7 @@ class Telemetry:
         self._newest_ns: dict[str, int] = {}
         self.velocities_left_out = 0  # not plausible; the first is reported
 
-    def add(self, raw: RawMessage) -> bool:
+    def add(self, raw: reader.RecordedMessage) -> bool:
         """Add a message, or report damage; False if it is out of order."""
         try:
             message = reader.decode(raw)
@@ -248,7 +247,7 @@ def _report_changed(
         )
 
 
-def read_ahead(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
+def read_ahead(messages: Iterator[reader.RecordedMessage]) -> Iterator[reader.RecordedMessage]:
     """The same messages, read by another thread while those before them are in use."""
     with ThreadPoolExecutor(1, 'read-ahead') as thread:
         pending = thread.submit(_batch, messages)
@@ -258,9 +257,9 @@ def read_ahead(messages: Iterator[RawMessage]) -> Iterator[RawMessage]:
                 yield batch.popleft()
 
 
-def _batch(messages: Iterator[RawMessage]) -> deque[RawMessage]:
+def _batch(messages: Iterator[reader.RecordedMessage]) -> deque[reader.RecordedMessage]:
     """The next messages, up to a size; none at the end."""
-    batch: deque[RawMessage] = deque()
+    batch: deque[reader.RecordedMessage] = deque()
     size = 0
     for raw in messages:
         batch.append(raw)

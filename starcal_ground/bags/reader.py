@@ -22,7 +22,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 import contextlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 import functools
 import io
 import itertools
@@ -38,21 +38,17 @@ import zlib
 
 import numpy as np
 
+from starcal_ground.bag_writer import ORIGIN
 from starcal_ground.bags import rosbag2
-from starcal_ros.errors import BagError, errors_as, ImageRefused, NotABag
+from starcal_ground.file_kinds import NotABag
+from starcal_ros.errors import BagError, errors_as, ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
 from starcal_ros.formats.messages.record_messages import checked_observations
 from starcal_ros.formats.messages.sensor_messages import image_of, view_image
-from starcal_ros.records import Image, ORIGIN, ORIGINAL, PIXELS_OF, refused_image, StarObservations
+from starcal_ros.records import Image, ORIGINAL, PIXELS_OF, refused_image, StarObservations
 from starcal_ros.text import printable
-from starcal_ros.untrusted import (
-    ARCHIVE_BYTES,
-    METADATA_BYTES,
-    read_text,
-    regular_file,
-    yaml_value,
-)
+from starcal_ros.untrusted import ARCHIVE_BYTES, read_text, regular_file, yaml_value
 
 if not rosbag2.READS_BAGS:
     from mcap.data_stream import ReadDataStream
@@ -88,6 +84,9 @@ MAGIC = b'\x89MCAP0\r\n'
 _MAGICS = (MAGIC, rosbag2.SQLITE_MAGIC) if rosbag2.READS_BAGS else (MAGIC,)
 _SUFFIXES = ('.mcap', '.db3') if rosbag2.READS_BAGS else ('.mcap',)
 IMAGE_FILE = 'image file '  # start of keys of `ORIGIN`: the stamp of an image follows, ns
+OF_THE_STARS = '(stars)'
+"""In place of a star tracker in recordings: the attitude is that of the image's own stars."""
+METADATA_BYTES = 4 * 1024 * 1024  # 5000 topics
 OF_ANOTHER_BAG = ' (of another bag)'  # behind the name of a file that two bags have
 _FOOTER = struct.Struct('<BQQQI')  # kind, length, start of summary and of its offsets, checksum
 _DATA_END = struct.Struct('<BQI')  # kind, length, checksum of all before it
@@ -119,12 +118,12 @@ def read_summary(file: Path) -> Summary | None:
             return None
 
 
-def origin_of(paths: Iterable[Path | str]) -> tuple[str, dict[str, str]]:
+def origin_of(paths: Iterable[Path | str]) -> dict[str, str]:
     """
-    Pixels of image files that bags were made of, and the SHA-256 of their files by name.
+    Entries of the provenance on the image files that bags were made of.
 
-    Both are empty for a bag that does not state them, as a recorded one.  Raises BagError as
-    `mcap_files`.
+    Which of their pixels, and the SHA-256 of each; empty for a bag that does not state them, as a
+    recorded one.  Raises BagError as `mcap_files`.
     """
     pixels_of: dict[str, None] = {}
     originals: dict[str, str] = {}
@@ -134,10 +133,10 @@ def origin_of(paths: Iterable[Path | str]) -> tuple[str, dict[str, str]]:
             if name == PIXELS_OF:
                 pixels_of[text] = None
             elif name.startswith(ORIGINAL):
-                name = name.removeprefix(ORIGINAL)
                 while originals.setdefault(name, text) != text:
                     name += OF_ANOTHER_BAG
-    return '; '.join(pixels_of), originals
+    origin = {PIXELS_OF: '; '.join(pixels_of)} if pixels_of else {}
+    return origin | originals
 
 
 def image_files(paths: Iterable[Path | str], offset_ns: int = 0) -> dict[int, str]:
@@ -181,9 +180,27 @@ def _lacks_checksum(stream: IO[bytes]) -> bool:
         return False
 
 
+@dataclass(frozen=True)
+class RecordedMessage(RawMessage):
+    """
+    A message of a bag; ``definition`` is that of its type there, empty for that of this version.
+
+    ``place`` is its file, the offset of its chunk there, or its own, and its number in the chunk;
+    None where the reader has none.
+    """
+
+    definition: str = ''
+    place: tuple[Path, int, int] | None = field(default=None, compare=False)
+
+    @property
+    def data(self) -> bytes:
+        """A copy of the message as bytes, because middleware does not accept a view."""
+        return bytes(self.view)
+
+
 def read_messages(
     file: Path, wanted: frozenset[Wanted] | None, on_damage: Damage
-) -> Iterator[RawMessage]:
+) -> Iterator[RecordedMessage]:
     """Intact messages that are wanted (None: all), in file order (rosbag2: in its own)."""
     if rosbag2.READS_BAGS:
         types = {topic.name: topic.type_name for topic in _listed_now(file)[0]}
@@ -191,7 +208,7 @@ def read_messages(
             if data[:4] == _ZSTD:
                 what = 'its messages are compressed one by one, which rosbag2 leaves'
                 raise BagError(f'{file}: {what}: {rosbag2.INSTALL}')
-            yield RawMessage(topic, types[topic], '', log_time_ns, memoryview(data))
+            yield RecordedMessage(topic, types[topic], log_time_ns, memoryview(data))
         return
     summary = read_summary(file)
     known = summary or Summary()
@@ -218,8 +235,8 @@ def read_messages(
                     is_text = schema.encoding == 'ros2msg'  # else of an .idl file, or none
                     texts[schema.id] = schema.data.decode(errors='replace') if is_text else ''
                 view, text = memoryview(_message(record.data)), texts[schema.id]
-                yield RawMessage(
-                    channel.topic, schema.name, text, record.log_time, view, (file, *place)
+                yield RecordedMessage(
+                    channel.topic, schema.name, record.log_time, view, text, (file, *place)
                 )
     if summary is None and pieces.complete:
         pieces.report('truncated, or its summary is damaged; all messages before it were read')
@@ -609,7 +626,7 @@ def read_raw(
     paths: Iterable[Path | str],
     only: Iterable[Wanted] | None = None,
     on_damage: Damage = log_damage,
-) -> Iterator[RawMessage]:
+) -> Iterator[RecordedMessage]:
     """Serialised messages of the given topics, or of types on them (None: all), in file order."""
     wanted = None if only is None else frozenset(only)
     for file in mcap_files(paths):
@@ -618,7 +635,7 @@ def read_raw(
 
 def by_stamp(
     paths: Iterable[Path | str], images: Iterable[Wanted], start: int = 0
-) -> Iterator[RawMessage]:
+) -> Iterator[RecordedMessage]:
     """
     Serialised images in the order of their stamps, without the first ones in file order.
 
@@ -639,7 +656,9 @@ def by_stamp(
         chunks = dict([*chunks.items(), ((file, offset), chunk)][-2:])
         record = chunk[number]
         assert isinstance(record, McapMessage)  # as when its place was found
-        yield RawMessage(*kind, log_time_ns, memoryview(_message(record.data)), place)
+        topic, type_name, definition = kind
+        view = memoryview(_message(record.data))
+        yield RecordedMessage(topic, type_name, log_time_ns, view, definition, place)
 
 
 def image_stamp_ns(raw: RawMessage) -> int:
@@ -698,7 +717,7 @@ def read_observations(
             yield refused_image(time_ns, 0, 0, 'bad_observations', str(error))
 
 
-def decode(raw: RawMessage) -> Message:
+def decode(raw: RecordedMessage) -> Message:
     """Message by the definition in the bag, else by that of ROS 2; raises BagError."""
     try:
         if rosbag2.READS_BAGS:
@@ -710,7 +729,7 @@ def decode(raw: RawMessage) -> Message:
         raise _undecodable(raw, error) from error
 
 
-def cdr_of_this_version(raw: RawMessage) -> bytes:
+def cdr_of_this_version(raw: RecordedMessage) -> bytes:
     """
     Bytes of a message for ROS, whose definition is that of this version; raises BagError.
 

@@ -10,13 +10,14 @@ import re
 
 from starcal_ground.bags import reader
 from starcal_ground.bags.frames import Frame, read_frames
+from starcal_ground.bags.reader import OF_THE_STARS
 from starcal_ground.bags.reader import Topics as Topics
 from starcal_ros.constants import CLOCKS_SET_NS, utc_text
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages import message_codec as codec
-from starcal_ros.pipeline.observe import observe_next, rewound, Track
+from starcal_ros.pipeline.observe import observe_next, Track
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Image, OF_THE_STARS, StarObservations
+from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.text import counted
 
 _OF_A_STAR_TRACKER = (
@@ -205,7 +206,7 @@ def read(
             track = track if is_sequence else Track(setup.prior)
             # The stamps of a bag are all known: these are not images of a wrong stamp.
             if track.latest_ns is not None and time_ns < track.latest_ns:
-                track = rewound(track)
+                track = _rewound(track)
             predicted_with = track.geometry
             observations, track = _of_frame(frame, setup, track)
             if on_image is not None:
@@ -264,3 +265,11 @@ def stated_tracker(options: Mapping[str, object]) -> list[str]:
     return [
         name for name, value in values.items() if not isinstance(value, Iterable) or any(value)
     ]
+
+
+def _rewound(track: Track) -> Track:
+    """State that takes an image of any stamp next, and searches it."""
+    trackers = {
+        name: dataclasses.replace(tracker, camera=None) for name, tracker in track.trackers.items()
+    }
+    return dataclasses.replace(track, latest_ns=None, trackers=trackers)

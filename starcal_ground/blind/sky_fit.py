@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import betainc
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera import CameraModel, project, rotation_jacobian
+from starcal_ros.camera import CameraModel, line_of_sight, project, rotation_jacobian
 from starcal_ros.camera.lens import coefficient_jacobian, distort, ideal_points
 from starcal_ros.sky.catalog import StarCatalog
 
@@ -71,10 +71,15 @@ class SourceImage:
         """Half of the diagonal, px."""
         return 0.5 * math.hypot(self.camera.width, self.camera.height)
 
-    @property
+    @functools.cached_property
     def half_diagonal_rad(self) -> float:
         """Mean angle of the corners from the axis of the prior camera."""
-        return min(self.camera.half_diagonal_rad, _WIDEST_RAD)
+        x, y = self.camera.width - 0.5, self.camera.height - 0.5
+        corners = np.array([[-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]])
+        cosine = line_of_sight(self.camera, corners)[:, 2]
+        # A corner that a strong distortion folds over has no line of sight.
+        seen = cosine[np.isfinite(cosine)]
+        return min(float(np.arccos(seen).mean()), _WIDEST_RAD) if len(seen) else _WIDEST_RAD
 
     @functools.cached_property
     def area_px2(self) -> float:

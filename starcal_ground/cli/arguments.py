@@ -152,7 +152,7 @@ def file_facts(args: argparse.Namespace) -> FileFacts:
 def given(args: argparse.Namespace, **options: object) -> Given:
     """Inputs that `add_inputs` asked for and further options; raises OptionError for bad ones."""
     from starcal_ground.images.first_setup import Given
-    from starcal_ros.pipeline.setup import read_values
+    from starcal_ground.parameter_files import read_values
 
     settings = dict(args.set) | options
     values = read_values(args.params) if args.params else {}

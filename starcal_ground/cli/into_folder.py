@@ -11,7 +11,7 @@ import functools
 from pathlib import Path
 import threading
 
-from starcal_ground import campaign, products
+from starcal_ground import campaign, products, written_files
 from starcal_ground.bags import reader
 from starcal_ground.cli import arguments
 from starcal_ground.cli.terminal import progress_bar
@@ -21,10 +21,8 @@ from starcal_ground.report import thumbnails
 from starcal_ros.constants import software_version
 from starcal_ros.errors import missing_package, OptionError, StarcalError, TooFewObservations
 from starcal_ros.formats.messages.message_codec import offset_ns
-from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import CameraGeometry, Image, ORIGINAL, PIXELS_OF, StarObservations
 
 
 def check_folder(folder: Path, bags: Sequence[Path], files: Sequence[Path]) -> None:
@@ -60,7 +58,7 @@ def digests(files: Sequence[Path]) -> Iterator[Callable[[], Mapping[str, str]]]:
     with ThreadPoolExecutor(1, 'digests') as thread:
         stopped = threading.Event()
         try:
-            yield thread.submit(solve.inputs_of, files, stopped.is_set).result
+            yield thread.submit(products.inputs_of, files, stopped.is_set).result
         finally:
             stopped.set()
 
@@ -114,7 +112,7 @@ def calibrate_into(
             with drawings.kind('report'):
                 page, report = _drawn(made, pictures, folder)
         if page:
-            product_files.write_atomically(path, page)
+            written_files.write_atomically(path, page)
         else:  # one that is there is of the products that were replaced
             path.unlink(missing_ok=True)
         written.result()
@@ -150,7 +148,12 @@ def _origin_of(source: campaign.Source) -> dict[str, str]:
     """Metadata of the observations: files that the bags, and each image, were made from."""
     offset_s = source.setup.attitude.stamp_offset_s if source.topics.image else 0.0
     names = reader.image_files(source.bags, offset_ns(offset_s))
-    return source.setup.origin | {f'{reader.IMAGE_FILE}{k}': name for k, name in names.items()}
+    of_files = {
+        key: words
+        for key, words in source.setup.origin.items()
+        if key == PIXELS_OF or key.startswith(ORIGINAL)
+    }
+    return of_files | {f'{reader.IMAGE_FILE}{k}': name for k, name in names.items()}
 
 
 def _write_observations(

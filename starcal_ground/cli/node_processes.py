@@ -17,8 +17,8 @@ import time
 from typing import NoReturn, TYPE_CHECKING
 
 from starcal_ground.child_process import module_command
+from starcal_ground.written_files import mark
 from starcal_ros.errors import StarcalError
-from starcal_ros.files import mark
 
 if TYPE_CHECKING:
     from starcal_ros.records import Calibration
@@ -77,7 +77,8 @@ def calibrate_with_nodes(
     """
     import yaml
 
-    from starcal_ros.formats.products.product_files import read_calibration, write_atomically
+    from starcal_ground.written_files import write_atomically
+    from starcal_ros.formats.products.product_files import read_calibration
 
     params, *_ = outputs(folder)
     content = {'/**': {'ros__parameters': dict(parameters)}}

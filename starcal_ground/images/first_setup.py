@@ -22,6 +22,7 @@ import numpy as np
 import yaml
 
 from starcal_ground.bags import reader
+from starcal_ground.bags.reader import OF_THE_STARS
 from starcal_ground.bags.topics import (
     choose_image_topic,
     choose_topics,
@@ -33,12 +34,12 @@ from starcal_ground.campaign import Source, ThroughAir
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.photographs import image_paths, NOT_STATED
 from starcal_ground.products import make_folder, write_camera_info
+from starcal_ground.written_files import write_atomically
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.pipeline.setup import files_of, load_setup, option_groups, paths_from, Setup
-from starcal_ros.records import Ensemble, OF_THE_STARS
+from starcal_ros.records import Ensemble, FOUND, PIXELS_OF
 from starcal_ros.text import printable
 
 PARAMETER_FILE, CAMERA_FILE = 'params.yaml', 'camera.yaml'
@@ -158,7 +159,8 @@ def write_setup(source: Source, stated: Mapping[str, object], folder: Path) -> N
     found = ''.join(f'# {printable(line)}\n' for line in source.notes)
     content = f'{found}/**:\n  ros__parameters:\n{textwrap.indent(text + to_state, 4 * " ")}'
     make_folder(folder)
-    write_camera_info(setup.prior.camera, folder / CAMERA_FILE, pixels_of=setup.pixels_of)
+    pixels_of = setup.origin.get(PIXELS_OF, '')
+    write_camera_info(setup.prior.camera, folder / CAMERA_FILE, pixels_of=pixels_of)
     write_atomically(folder / PARAMETER_FILE, content)
 
 
@@ -243,8 +245,7 @@ def source_of(
 
 def _of_origin(setup: Setup, bags: Sequence[Path]) -> Setup:
     """A setup of bags with what they state of the files that they were made from."""
-    pixels_of, originals = reader.origin_of(bags)
-    return dataclasses.replace(setup, pixels_of=pixels_of, originals=originals)
+    return dataclasses.replace(setup, origin={**setup.origin, **reader.origin_of(bags)})
 
 
 def air_of(setup: Setup) -> ThroughAir | None:
@@ -278,7 +279,9 @@ def _of_attitudes(given: Given, folder: Path) -> tuple[Setup, tuple[str, ...]]:
     words = f'images of {topic}: {stars.in_a_sentence()}'
     ways = [options['attitude_direction']] if 'attitude_direction' in options else _DIRECTIONS
     setups = [
-        dataclasses.replace(load_setup({**options, 'attitude_direction': way}), found=('camera',))
+        dataclasses.replace(
+            load_setup({**options, 'attitude_direction': way}), origin={FOUND: 'camera'}
+        )
         for way in ways
     ]
     for setup in setups:

@@ -12,10 +12,11 @@ from typing import NamedTuple
 import erfa
 import numpy as np
 
+from starcal_ground.fits_keywords import FACTS, stated, text_of, value_of
 from starcal_ground.images.time_systems import from_mjd, from_text, system_of, SYSTEMS
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.formats.fits_keywords import Card, FACTS, stated, text_of, value_of
+from starcal_ros.formats.image_files import Card
 
 # Keywords with the time of day of a date alone: a custom older than the standard.
 _CLOCKS = {

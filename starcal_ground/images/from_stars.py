@@ -50,7 +50,7 @@ _HALF_FIELDS_DEG = (
     *((_PINHOLE, deg) for deg in (6.0, 4.0, 2.7)),
 )
 _SEARCHED = 4  # images that are searched over all focal lengths
-_MOST_EFFORT = 20_000  # of the search for a first camera: 100 to 200 s of processor time
+_MOST_EFFORT = 20_000  # limit of the first search: 100 to 200 s of processor time
 _BRIEF_EFFORT = 500  # about 4 s: enough for seven of eight simulated cameras of 6 to 117 degrees
 _CENTROID_PX = 0.3  # 1-sigma of the centroid of a bright source
 _HOT_PIXEL_PX = 0.2  # extent of a source that is wider than one pixel

@@ -17,14 +17,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ground.fits_images import FileImage, read_fits
+from starcal_ground.fits_keywords import value_of
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import number_of
 from starcal_ground.mirror import MIRRORED, mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import IngestError, OptionError
-from starcal_ros.formats.fits_keywords import Card, value_of
-from starcal_ros.formats.image_files import FileImage, read_image
-from starcal_ros.formats.messages.sensor_messages import of_mosaic
+from starcal_ros.formats.image_files import Card, check_shape, is_fits, read_image
+from starcal_ros.formats.messages.sensor_messages import CHANNELS, of_mosaic, plane
 
 _ROWS = 256  # mapped at a time: an image in double precision can exceed the memory
 _FULL = 65000  # largest 16-bit value written: the end of the range means saturation
@@ -206,15 +207,23 @@ def check_alike(files: Sequence[ImageFile]) -> None:
 
 
 def _of_options(path: Path, options: ImageOptions) -> FileImage:
-    image = read_image(path, options.hdu, options.channel, options.bayer)
-    values = image.values
-    if image.mosaic and not options.bayer:
-        if not options.channel:
+    """One channel of an image file, by the mosaic of the options or else of its header."""
+    image = read_fits(path, options.hdu) if is_fits(path) else FileImage(read_image(path), {})
+    values, channel = image.values, options.channel
+    if (values.ndim == 3 or options.bayer) and channel not in CHANNELS:
+        raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
+    if values.ndim == 3:
+        values = plane(values, 'rgb', channel)
+    elif options.bayer:
+        values = of_mosaic(values, options.bayer.lower(), channel)
+    elif image.mosaic:
+        if not channel:
             raise IngestError(
                 f'{path}: a mosaic, {image.mosaic.upper()} by its header: choose --channel red,'
                 ' green or blue'
             )
-        values = of_mosaic(values, image.mosaic, options.channel)
+        values = of_mosaic(values, image.mosaic, channel)
+    check_shape(path, values.shape)
     pixels_of = '; '.join(filter(None, [image.pixels_of, options.pixels_of]))
     return image._replace(values=mirrored(values, options.flip), pixels_of=pixels_of)
 

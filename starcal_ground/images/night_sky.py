@@ -31,14 +31,22 @@ from starcal_ground.images import stated as stated_facts
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.unknown_air import EARTH_M_S, with_air
 from starcal_ground.mirror import MIRRORED, mirrored
+from starcal_ground.products import input_name
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import CLOCKS_SET_NS
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.pipeline.setup import load_setup, option_groups
-from starcal_ros.pipeline.solve import input_name
-from starcal_ros.records import CameraGeometry, Image, refused_image, StarObservations
+from starcal_ros.records import (
+    CameraGeometry,
+    FOUND,
+    Image,
+    PIXELS_OF,
+    refused_image,
+    StarObservations,
+    TIMES,
+)
 from starcal_ros.robust_statistics import MAD_TO_SIGMA
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
@@ -189,13 +197,11 @@ def from_photographs(
         *curve,
     ]
     source = _set_up(stars, [bag], stated, folder, is_located, Topics(), [*filter(None, notes)])
-    setup = dataclasses.replace(
-        source.setup,
-        times_of=stated_facts.times_of(photographs),
-        pixels_of='; '.join(filter(None, pixels_of)),
-    )
-    notes = [f'the time is that {setup.times_of}' * bool(setup.times_of)]
-    notes += [f'pixels of the camera: {setup.pixels_of}' * bool(setup.pixels_of)]
+    times, pixels = stated_facts.times_of(photographs), '; '.join(filter(None, pixels_of))
+    stated_origin = {key: words for key, words in ((TIMES, times), (PIXELS_OF, pixels)) if words}
+    setup = dataclasses.replace(source.setup, origin={**source.setup.origin, **stated_origin})
+    notes = [f'the time is that {times}' * bool(times)]
+    notes += [f'pixels of the camera: {pixels}' * bool(pixels)]
     return dataclasses.replace(source, setup=setup, notes=(*source.notes, *filter(None, notes)))
 
 
@@ -384,7 +390,7 @@ def _set_up(
     # Nobody has stated a lens: beyond the stars a wrong one is off by more than any field shows.
     stated = {} if values.get('camera_info_url') else {'lens_model': 'auto'}
     setup = load_setup({**stated, **by_stars.options_of(values)}, prior=prior)
-    setup = dataclasses.replace(setup, found=('camera',))
+    setup = dataclasses.replace(setup, origin={FOUND: 'camera'})
     notes = [*notes, stars.in_a_sentence()]
     if unused := stated_tracker(values):
         notes.append(f'not used, since the attitudes are those of the stars: {", ".join(unused)}')

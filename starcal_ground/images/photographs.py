@@ -32,6 +32,8 @@ from starcal_ground.file_kinds import (
     RAW,
     UNKNOWN,
 )
+from starcal_ground.fits_images import FileImage, read_fits
+from starcal_ground.fits_keywords import FACTS
 from starcal_ground.images import fits_facts
 from starcal_ground.images.fits_facts import FocalLength, Moment, number_of
 from starcal_ground.images.image_series import FileFacts, scale_of
@@ -39,15 +41,7 @@ from starcal_ground.mirror import mirrored
 from starcal_ros.arrays import Pixels
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.fits_keywords import FACTS
-from starcal_ros.formats.image_files import (
-    content_of,
-    decoded,
-    FileImage,
-    in_rgb,
-    MOST_VALUES,
-    read_fits,
-)
+from starcal_ros.formats.image_files import content_of, decoded, in_rgb, MOST_VALUES
 from starcal_ros.formats.messages.sensor_messages import CHANNELS
 from starcal_ros.text import counted
 

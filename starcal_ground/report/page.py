@@ -20,7 +20,7 @@ import cv2
 import jinja2
 from markupsafe import Markup
 
-from starcal_ground import products
+from starcal_ground import products, written_files
 from starcal_ground.bags import reader
 from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
 from starcal_ground.report.thumbnails import Thumbnail
@@ -29,7 +29,7 @@ from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products import product_files
-from starcal_ros.pipeline import annotation, solve
+from starcal_ros.pipeline import annotation
 from starcal_ros.record_fields import nearest
 from starcal_ros.records import (
     Calibration,
@@ -37,6 +37,7 @@ from starcal_ros.records import (
     PIXELS_OF,
     STAR_REFUSALS,
     StarObservations,
+    TIMES,
     TOTAL,
 )
 from starcal_ros.text import significant
@@ -136,7 +137,7 @@ def write_report(folder: Path) -> Path:
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / products.REPORT_FILE
-    product_files.write_atomically(path, render(_read_folder(folder), folder))
+    written_files.write_atomically(path, render(_read_folder(folder), folder))
     return path
 
 
@@ -190,7 +191,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
     ]
     return {
         'calibration': calibration,
-        'times_of': calibration.provenance.get(solve.TIMES, ''),
+        'times_of': calibration.provenance.get(TIMES, ''),
         'pixels_of': calibration.provenance.get(PIXELS_OF, ''),
         'parameters': verdict.parameter_rows(calibration, prior),
         'alignment': verdict.alignment_rows(calibration, prior),
@@ -209,7 +210,7 @@ def _context(contents: Found, folder: Path) -> Mapping[str, object]:
         'refused_images': Counter(calibration.images_refused).most_common(),
         'refused_stars': [*products.refused_stars(observations).items()],
         'model_sentences': verdict.model_sentences(calibration),
-        'files': [(name, *solve.inputs_of([folder / name]).values()) for name in written],
+        'files': [(name, *products.inputs_of([folder / name]).values()) for name in written],
         'pictures': {one.time_ns: one for one in pictures if not one.is_expected},
         'options': _options(calibration),
     }
@@ -244,7 +245,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     pictures = thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
     text = page_template('failure.html').render(record=record, pictures=pictures)
     path = folder / products.REPORT_FILE
-    product_files.write_atomically(path, text)
+    written_files.write_atomically(path, text)
     return path
 
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.products import make_folder
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.annotation import annotate_reduced, stretch
 from starcal_ros.pipeline.setup import Setup

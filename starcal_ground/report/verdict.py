@@ -140,7 +140,7 @@ def next_step(calibration: records.Calibration) -> str:
         return ' '.join(f'To lower a sigma most, {row}.' for row in calibration.statements[:1])
     failed = [check for check in calibration.gate if check.passed is False]
     if {check.option for check in failed} == {REQUIREMENTS}:
-        names: dict[str, list[str]] = {}  # of the sigmas, by their step
+        names: dict[str, list[str]] = {}  # names of the sigmas, by their step
         for check in failed:
             # Behind the first semicolon of the note is the remedy of the largest cause.
             names.setdefault(check.note.partition('; ')[2], []).append(check.name)

@@ -24,11 +24,12 @@ from starcal_ground.mirror import mirrored
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_files import read_text, write_atomically
+from starcal_ros.formats.products.product_files import read_text
 from starcal_ros.records import AttitudeSample, Calibration, CameraGeometry, Image
 from starcal_ros.sky.astrometry import earth_velocity_c
 from starcal_ros.untrusted import json_value, PRODUCT_BYTES

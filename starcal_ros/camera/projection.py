@@ -142,15 +142,6 @@ class CameraModel(Record):
         return np.array([[fx, skew, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
 
     @functools.cached_property
-    def half_diagonal_rad(self) -> float:
-        """Mean angle of the corners from the axis; infinite if none has a line of sight."""
-        x, y = self.width - 0.5, self.height - 0.5
-        cosine = line_of_sight(self, np.array([[-0.5, -0.5], [x, -0.5], [-0.5, y], [x, y]]))[:, 2]
-        # A corner that a strong distortion folds over has no line of sight.
-        seen = cosine[np.isfinite(cosine)]
-        return float(np.arccos(seen).mean()) if len(seen) else np.inf
-
-    @functools.cached_property
     def _field_radii_rad(self) -> dict[float, float]:
         """Found by `field_radius_rad`, by the margin in px: each image asks for the same one."""
         return {}

@@ -58,7 +58,7 @@ from starcal_ros.estimation.tracker_errors import (
 from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
-EXACT_RAD = 1e-3 * ARCSECOND_RAD  # of the star tracker in Method 2, which takes it as exact
+EXACT_RAD = 1e-3 * ARCSECOND_RAD  # sigma in Method 2, which takes the star tracker as exact
 _SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
 # Nodes of the factor as a function of magnitude, at quantiles.  Without that function, halves of
 # two real sets differ by 1.19 and 1.92 of their sigma, with it by 1.01 and 1.75.

@@ -3,13 +3,13 @@
 Images in FITS, TIFF and PNG files: kind and size before they are decoded, values, cards.
 
 The pixels of FITS are those of the largest image of the file, its overscan cut off, its first row
-at the top; what is known of this is stated by the keywords of `fits_keywords`.
+at the top, by the keywords `ROW_ORDER`, `REGION` and `WITHOUT_LIGHT`.
 """
 
 from __future__ import annotations
 
 import bz2
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 import contextlib
 import math
 import os
@@ -24,7 +24,6 @@ import numpy as np
 
 from starcal_ros.arrays import AnyArray
 from starcal_ros.errors import errors_as, IngestError, needing
-from starcal_ros.formats.fits_keywords import Card, FACTS, stated, text_of, value_of
 from starcal_ros.formats.messages import sensor_messages
 from starcal_ros.untrusted import regular_file
 
@@ -40,49 +39,43 @@ _TIFF_MOST_ENTRIES = 1000
 # Extensions that are of the image and no image of the sky, by their names.
 _OF_ANOTHER = re.compile(r'BPM|MASK|DQ|ERR|VAR|WHT|WEIGHT|IVAR|UNC|NOISE|BACK|BKG|FLAG|THUMB')
 _SECTION = re.compile(r'\[(\d+):(\d+),(\d+):(\d+)\]')
-_PATTERN = re.compile('[RGBCMYW]{4}')  # a colour filter mosaic of 2 x 2 pixels
-_OTHER_GREENS = 0.05
-_PATTERNS = ('RGGB', 'BGGR', 'GBRG', 'GRBG')
+# Keywords, of which the first in a header counts.
+ROW_ORDER = ('ROWORDER',)
+REGION = ('TRIMSEC', 'DATASEC')
+WITHOUT_LIGHT = ('BIASSEC',)
 
 
-class FileImage(NamedTuple):
+class Card(NamedTuple):
+    """Value and comment of a FITS keyword."""
+
+    value: Any
+    comment: str = ''
+
+
+class FitsImage(NamedTuple):
     """
-    Unscaled values (height, width), or with three channels, of an image file.
+    Unscaled values (height, width), or with three channels, of a FITS file, and its cards.
 
-    ``header`` are its FITS cards, ``mosaic`` its Bayer pattern, empty for none; ``pixels_of`` says
-    which pixels of the file the values are, empty for all of them, in order.
+    ``pixels_of`` states which pixels of the file the values are, empty for all of them, in order;
+    ``first`` are the column and row of the first of them in the file, rows from the top.
     """
 
     values: AnyArray
     header: Mapping[str, Card]
-    mosaic: str = ''
     pixels_of: str = ''
+    first: tuple[int, int] = (0, 0)
 
 
-def read_image(path: Path, hdu: str = '', channel: str = '', bayer: str = '') -> FileImage:
-    """
-    Values (height, width) of an image file; raises IngestError.
-
-    ``hdu`` is the number or name of a FITS extension, empty for the largest image; ``channel`` is
-    red, green or blue of a colour image, ``bayer`` the pattern of a mosaic to take it from.
-    """
+def read_image(path: Path) -> AnyArray:
+    """Values of a FITS, TIFF or PNG, (height, width) or with channels; raises IngestError."""
     if is_fits(path):
-        image = read_fits(path, hdu)
-    else:
-        content = content_of(path)
-        if not (sensor_messages.png_header(content) or tiff_header(content)):
-            raise IngestError(f'{path}: not an image in FITS, TIFF or PNG')
-        image = FileImage(in_rgb(decoded(path, content)), {})
-    values = image.values
-    is_colour = values.ndim == _RGB and values.shape[2] == _RGB
-    if (is_colour or bayer) and channel not in sensor_messages.CHANNELS:
-        raise IngestError(f'{path}: a colour image: choose --channel red, green or blue')
-    if is_colour:
-        values = sensor_messages.plane(values, 'rgb', channel)
-    elif bayer:
-        values = sensor_messages.of_mosaic(values, bayer.lower(), channel)
-    _check_shape(path, values.shape)
-    return image._replace(values=values)
+        return read_fits(path).values
+    content = content_of(path)
+    if not (sensor_messages.png_header(content) or tiff_header(content)):
+        raise IngestError(f'{path}: not an image in FITS, TIFF or PNG')
+    values = in_rgb(decoded(path, content))
+    check_shape(path, values.shape)
+    return values
 
 
 def in_rgb(values: AnyArray) -> AnyArray:
@@ -90,7 +83,8 @@ def in_rgb(values: AnyArray) -> AnyArray:
     return values[:, :, 2::-1] if values.ndim == _RGB else values  # BGR, with alpha last
 
 
-def _check_shape(path: Path, shape: tuple[int, ...]) -> None:
+def check_shape(path: Path, shape: tuple[int, ...]) -> None:
+    """Raise IngestError for an array that is neither an image nor three colour planes."""
     if not (len(shape) == _GREY or shape[_GREY:] == (_RGB,)) or min(shape) < 2:
         raise IngestError(
             f'{path}: array of shape {shape}, neither an image nor three colour planes: write '
@@ -134,7 +128,7 @@ def is_fits(path: Path) -> bool:
     return start.startswith(b'SIMPLE  =')
 
 
-def read_fits(path: Path, hdu: str = '') -> FileImage:
+def read_fits(path: Path, hdu: str = '') -> FitsImage:
     """Image ``hdu`` of a FITS file, or the largest one; raises IngestError."""
     with needing('mission', IngestError, path):
         from astropy.io import fits
@@ -166,10 +160,9 @@ def read_fits(path: Path, hdu: str = '') -> FileImage:
     values = values.squeeze()
     if values.ndim == _RGB and values.shape[0] == _RGB:
         values = np.moveaxis(values, 0, -1)  # a cube of three planes
-    _check_shape(path, values.shape)
-    values, mosaic, region = _upright(path, values, header)
-    pixels_of = ', '.join(filter(None, [words, region]))
-    return FileImage(values.astype(values.dtype.newbyteorder('=')), header, mosaic, pixels_of)
+    check_shape(path, values.shape)
+    image = _upright(values.astype(values.dtype.newbyteorder('=')), header)
+    return image._replace(pixels_of=', '.join(filter(None, [words, image.pixels_of])))
 
 
 def _largest(units: Any) -> tuple[Any, str]:
@@ -189,51 +182,20 @@ def _largest(units: Any) -> tuple[Any, str]:
     return unit, f'HDU {number} of {count} images of one size' * (count > 1)
 
 
-def _upright(
-    path: Path, values: AnyArray, header: Mapping[str, Card]
-) -> tuple[AnyArray, str, str]:
-    """Values without overscan, first row at the top; the pattern of a mosaic; words on both."""
+def _upright(values: AnyArray, header: Mapping[str, Card]) -> FitsImage:
+    """The image without overscan, its first row at the top."""
     height, width = values.shape[:2]
     (left, right), (low, high), words = _region(header, width, height)
     values = values[low:high, left:right]
-    top = low
-    if text_of(header, 'order of the rows').upper().startswith('BOTTOM'):
-        values, top = values[::-1], height - high
+    if _text(header, ROW_ORDER).upper().startswith('BOTTOM'):
         words = ', '.join(filter(None, [words, 'rows last to first (ROWORDER)']))
-    pattern = text_of(header, 'mosaic').upper()
-    if values.ndim != _GREY or not _PATTERN.fullmatch(pattern):
-        return values, '', words
-    if pattern not in _PATTERNS:
-        key = stated(header, 'mosaic')
-        raise IngestError(
-            f'{path}: {key} {pattern}: of mosaics {", ".join(_PATTERNS)} are read: write one'
-            ' colour of it to a file'
-        )
-    x, y = (
-        int(value_of(header, key)) if (key := stated(header, f'first {side} in the mosaic')) else 0
-        for side in ('column', 'row')
-    )
-    rows = [pattern[:2], pattern[2:]]
-    shifted = [rows[(j + y + top) % 2][(i + x + left) % 2] for j in (0, 1) for i in (0, 1)]
-    if _has_other_greens(values, shifted):
-        shifted = shifted[2:] + shifted[:2]
-    found = ''.join(shifted)
-    of_mosaic = f'mosaic {found} ({stated(header, "mosaic")})'
-    return values, found.lower(), ', '.join(filter(None, [words, of_mosaic]))
+        return FitsImage(values[::-1], header, words, (left, height - high))
+    return FitsImage(values, header, words, (left, low))
 
 
-def _has_other_greens(values: AnyArray, letters: Sequence[str]) -> bool:
-    """
-    True if the two sites without green of a mosaic have one level, and those of green have not.
-
-    A program that turns an image over, or counts rows from the other end, leaves the keyword as
-    it is.  The greens of a detector differ by a percent or two.
-    """
-    levels = [float(np.nanmedian(values[j::2, i::2])) for j in (0, 1) for i in (0, 1)]
-    greens = [level for level, letter in zip(levels, letters, strict=True) if letter == 'G']
-    others = [level for level, letter in zip(levels, letters, strict=True) if letter != 'G']
-    green, other = float(np.ptp(greens)), float(np.ptp(others))
-    return green > _OTHER_GREENS * abs(float(np.mean(levels))) and other < green / 3.0
+def _text(header: Mapping[str, Card], keywords: tuple[str, ...]) -> str:
+    """Text of the first of some keywords that a header has; empty if none."""
+    return next((str(header[key].value).strip() for key in keywords if key in header), '')
 
 
 def _region(
@@ -245,14 +207,14 @@ def _region(
     A region of the size of the image was cut by the program that wrote it.
     """
     whole = (0, width), (0, height)
-    stating = [key for key in FACTS['region of the image'].keywords if key in header]
+    stating = [key for key in REGION if key in header]
     for key in stating:
         section = _section(str(header[key].value), width, height)
         if section is not None:
             return *section, _in_words(*section, key) * (section != whole)
     if stating:
         return *whole, f'{stating[0]} is not in the image: nothing cut off'
-    strip = _section(text_of(header, 'region without light'), width, height)
+    strip = _section(_text(header, WITHOUT_LIGHT), width, height)
     if strip is None:
         return *whole, ''
     (left, right), (low, high) = strip
@@ -261,7 +223,7 @@ def _region(
         kept = ((right, width) if left == 0 else (0, left)), (0, height)
     elif (left, right) == whole[0] and (low == 0) != (high == height):
         kept = (0, width), ((high, height) if low == 0 else (0, low))
-    return *kept, _in_words(*kept, stated(header, 'region without light')) * (kept != whole)
+    return *kept, _in_words(*kept, WITHOUT_LIGHT[0]) * (kept != whole)
 
 
 def _section(text: str, width: int, height: int) -> tuple[tuple[int, int], tuple[int, int]] | None:

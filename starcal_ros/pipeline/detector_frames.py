@@ -147,7 +147,7 @@ def _bad_pixels(path: str, width: int, height: int) -> Indices:
 def _read(name: str, path: str, width: int, height: int) -> AnyArray:
     expected = f'expected one channel of {width} x {height}'
     try:
-        values = read_image(Path(path.removeprefix('file://'))).values
+        values = read_image(Path(path.removeprefix('file://')))
     except IngestError as error:
         raise OptionError(f'{name}: {error}; {expected}') from error
     if values.shape != (height, width):

@@ -79,14 +79,6 @@ class Track:
         return self.trackers.get(name, TrackerState())
 
 
-def rewound(track: Track) -> Track:
-    """State that takes an image of any stamp next, and searches it."""
-    trackers = {
-        name: dataclasses.replace(tracker, camera=None) for name, tracker in track.trackers.items()
-    }
-    return dataclasses.replace(track, latest_ns=None, trackers=trackers)
-
-
 @one_blas_thread()
 def observe_next(
     image: Image,

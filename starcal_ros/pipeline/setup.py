@@ -43,7 +43,7 @@ from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.options import option
 from starcal_ros.pipeline.detector_frames import DetectorFrames, NO_FRAMES, read_detector_frames
-from starcal_ros.records import CameraGeometry, ORIGINAL, PIXELS_OF
+from starcal_ros.records import CameraGeometry, FOUND
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions, Mounting
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog, StarCatalog
@@ -142,9 +142,6 @@ def check_prior_camera(camera: CameraModel, location: str) -> None:
         )
 
 
-NODES = ('star_observer', 'calibrator')
-
-
 @dataclass(frozen=True)
 class SetupOptions:
     """Prior camera and alignment, frames, catalog and detector frames."""
@@ -207,10 +204,9 @@ class Setup:
     Options of every stage, with prior camera, catalog and detector frames loaded.
 
     Without a prior alignment ``is_aligned`` is false and ``prior`` has the identity until the
-    alignment is determined.  ``times_of`` says where stamps are from that are not of the images,
-    ``pixels_of`` which pixels of image files the images are, if they are not all, in order.
-    ``found`` names the parts of the prior, camera or alignment, that are a first solution of the
-    images.  ``originals`` has the SHA-256 of the files that the bags were made from, by name.
+    alignment is determined.  ``origin`` has the entries of the provenance on image files and on
+    parts of the prior that are a first solution of the images: `TIMES`, `PIXELS_OF`, `FOUND`, and
+    those that begin with `ORIGINAL`.
     """
 
     frames: SetupOptions
@@ -227,16 +223,7 @@ class Setup:
     is_aligned: bool = True
     camera_name: str = camera_yaml.DEFAULT_CAMERA_NAME
     mountings: tuple[Mounting, ...] = ()
-    times_of: str = ''
-    pixels_of: str = ''
-    found: tuple[str, ...] = ()
-    originals: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def origin(self) -> dict[str, str]:
-        """Entries of the provenance on the files that the images were made from."""
-        words = {PIXELS_OF: self.pixels_of} if self.pixels_of else {}
-        return words | {f'{ORIGINAL}{name}': value for name, value in self.originals.items()}
+    origin: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def has_tracker(self) -> bool:
@@ -314,28 +301,6 @@ class CalibratorOptions:
 
 NODE_OPTION_CLASSES = (NodeOptions, ObserverOptions, CalibratorOptions)
 """Options that a parameter file may hold besides those of the processing stages."""
-
-
-def read_setup(params: Path) -> Setup:
-    """
-    Setup of a ROS parameter file, which may also set parameters of the nodes.
-
-    Raises as `load_setup`; the message on an option begins with the file.
-    """
-    values = read_values(params)
-    try:
-        return load_setup(values)
-    except OptionError as error:
-        raise OptionError(f'{params}: {error}') from error
-
-
-def read_values(params: Path) -> dict[str, object]:
-    """
-    Options of a ROS parameter file by name; relative paths are relative to that file.
-
-    Raises OptionError when it is not a parameter file.
-    """
-    return paths_from(options.read_parameter_file(params, NODES), params.parent)
 
 
 def paths_from(values: Mapping[str, object], folder: Path) -> dict[str, object]:
@@ -435,7 +400,8 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
 def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
     """A copy of a setup with the prior alignment found from the images."""
     prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
-    return replace(setup, prior=prior, is_aligned=True, found=(*setup.found, 'alignment'))
+    found = ', '.join(filter(None, (setup.origin.get(FOUND), 'alignment')))
+    return replace(setup, prior=prior, is_aligned=True, origin={**setup.origin, FOUND: found})
 
 
 def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:

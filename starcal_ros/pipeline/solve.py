@@ -7,13 +7,11 @@ A calibration has its provenance: software, options, catalog, prior and observat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 import dataclasses
 import hashlib
 import json
 import math
-import os
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -29,7 +27,7 @@ from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert, ros_fit
 from starcal_ros.constants import ARCSECOND_RAD, software_version
-from starcal_ros.errors import errors_as, OptionError, TooFewObservations
+from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.identification.star_finder import realigned
@@ -41,46 +39,28 @@ from starcal_ros.records import (
     Ensemble,
     EnsembleStatus,
     factored_field,
-    FOUND,
     StarObservations,
+    TIMES,
 )
-from starcal_ros.untrusted import regular_file
 
-TIMES = 'image times'
-"""Key of the provenance: where the stamps are from, if the images state none."""
 _FEWEST_STARS = 3  # two fit their mirror image
 _SHOWING = 50  # stars, from bright to faint, show the constellation as well as all
 _MOST_OFF = 0.5  # misfit in RMS sizes of a constellation; a mirrored one misfits by 1.4
 _ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
-def ensemble_of(observations: Iterable[StarObservations], setup: Setup) -> Ensemble:
-    """
-    The ensemble of some images, each checked as by `add_to_ensemble`.
-
-    The least informative are dropped once there are twice as many as are kept, and at the end: to
-    weigh all images again for each further one would take longer than to measure it.
-    """
-    ensemble = Ensemble()
-    for image in observations:
-        ensemble = ensemble.add(_checked(image, setup))
-        if len(ensemble.images) >= 2 * setup.calibration.max_images:
-            ensemble = within_limit(ensemble, setup)
-    return within_limit(ensemble, setup)
-
-
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
+    """Return the ensemble with one more image, and without the least informative if too many."""
+    return within_limit(ensemble.add(checked(observations, setup)), setup)
+
+
+def checked(observations: StarObservations, setup: Setup) -> StarObservations:
     """
-    Return the ensemble with one more image, and without the least informative if too many.
+    Return the observations, refused if they cannot be of the prior camera.
 
-    An image whose size differs from the prior camera's is counted as refused: it is from another
-    camera.  So is one whose stars no rotation brings near their pixels, as negated directions.
+    Images of another size are not, nor those whose stars no rotation brings near their pixels, as
+    negated directions.
     """
-    return within_limit(ensemble.add(_checked(observations, setup)), setup)
-
-
-def _checked(observations: StarObservations, setup: Setup) -> StarObservations:
-    """Return the observations, refused if they cannot be of the prior camera."""
     size, camera = (observations.width, observations.height), setup.prior.camera
     if not observations.refusal and size != (camera.width, camera.height):
         observations = dataclasses.replace(observations, refusal='wrong_size')
@@ -192,7 +172,7 @@ def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
     colours_of = setup.catalog.colours_bp_rp if is_same else None
     given = ensemble, setup.prior, setup.calibration, colours_of
     if setup.frames.lens_model == 'auto':
-        return estimate_with_smallest_lens(*given)[0]
+        return estimate_with_smallest_lens(*given)
     return estimate_calibration(*given)
 
 
@@ -207,6 +187,7 @@ def _not_judged(
     )
     stamps_ns = [image.time_ns for image in ensemble.images]
     budget = sigma_budget(result, setup.calibration, has_alignment=setup.has_tracker)
+    has_dates = TIMES not in setup.origin
     return Calibration(
         time_ns=max(stamps_ns),
         first_image_ns=min(stamps_ns),
@@ -252,7 +233,7 @@ def _not_judged(
         ),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=budget,
-        statements=statements(budget, result, setup.calibration, has_dates=not setup.times_of),
+        statements=statements(budget, result, setup.calibration, has_dates=has_dates),
     )
 
 
@@ -266,9 +247,9 @@ def estimate_with_smallest_lens(
     prior: CameraGeometry,
     options: CalibrationOptions,
     colours_of: Callable[[Indices], Floats] | None = None,
-) -> tuple[Estimate, CameraGeometry]:
+) -> Estimate:
     """
-    Return the estimate with the smallest lens model that needs no field, and the prior with it.
+    Return the estimate with the smallest lens model that needs no field.
 
     The model of the prior camera comes first, then the others by the number of their coefficients.
     A model is accepted where the likelihood of a field beside it is not larger than chance makes
@@ -286,7 +267,7 @@ def estimate_with_smallest_lens(
         For options that do not go together.
     """
     least = math.inf
-    best: tuple[Estimate, CameraGeometry] | None = None
+    best: Estimate | None = None
     shortage = TooFewObservations('no lens model describes the prior camera')
     others = sorted(
         LENSES.keys() - {prior.camera.model}, key=lambda m: len(LENSES[m].coefficients)
@@ -313,10 +294,10 @@ def estimate_with_smallest_lens(
             continue  # beyond the stars it folds
         ratio = estimate.posterior.field.likelihood_ratio
         if ratio < _CHANCE:
-            return estimate, started
+            return estimate
         if is_shown and ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients) < least:
             least = ratio + _PER_COEFFICIENT * len(LENSES[model].coefficients)
-            best = estimate, started
+            best = estimate
     if best is None:
         raise shortage
     return best
@@ -344,36 +325,9 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'options': json.dumps(setup.options(), sort_keys=True),
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': _digest(ensemble),
-        **({TIMES: setup.times_of} if setup.times_of else {}),
-        **({FOUND: ', '.join(setup.found)} if setup.found else {}),
         **setup.origin,
         **{f'input {name}': value for name, value in inputs.items()},
     }
-
-
-def inputs_of(
-    files: Iterable[Path], is_stopped: Callable[[], bool] = lambda: False
-) -> dict[str, str]:
-    """
-    SHA-256 of the files that a calibration is made from, by their paths.
-
-    ``is_stopped`` is polled between blocks of 1 MB, so that another thread can stop it early; the
-    digests are then invalid.
-    """
-    digests = {}
-    for path in files:
-        digest = hashlib.sha256()
-        with errors_as(OptionError, path), regular_file(path) as file:
-            while not is_stopped() and (block := file.read(1 << 20)):
-                digest.update(block)
-        digests[input_name(path)] = f'sha256:{digest.hexdigest()}'
-    return digests
-
-
-def input_name(path: Path) -> str:
-    """Name of an input file in a provenance, in Unicode whatever its bytes are."""
-    # Bytes that are not UTF-8 are written as Python writes them, \\xff.
-    return os.fsencode(path).decode(errors='backslashreplace')
 
 
 def _digest(ensemble: Ensemble) -> str:

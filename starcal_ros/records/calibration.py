@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 TOTAL = 'total'
+TIMES = 'image times'
+"""Key of the provenance: where the stamps are from, if the images state none."""
 PIXELS_OF = 'image pixels'
 """Key of the provenance: which pixels of image files are those of the camera, if not all."""
 FOUND = 'found by the stars'
 """Key of the provenance: parts of the prior, camera or alignment, that nobody has stated."""
 ORIGINAL = 'original '
 """Start of the keys of the provenance with the SHA-256 of files that a bag was made from."""
-ORIGIN = 'starcal_origin'
-"""Metadata record of a bag with the entries of the provenance that the bag carries."""
 BUDGET_COLUMNS, BUDGET_ROWS = 9, 7
 ALIGNMENT_NAMES = ('alignment_x', 'alignment_y', 'alignment_z')
 

@@ -122,8 +122,6 @@ class AttitudeSample:
     icrf_from_star_tracker_xyzw: Floats
 
 
-OF_THE_STARS = '(stars)'
-"""In place of a star tracker in recordings: the attitude is that of the image's own stars."""
 LEAST_DEGC, MOST_DEGC = -273.15, 1000.0
 """Lowest and highest temperature of a camera."""
 _Name = Annotated[str, fields.Most(most_characters=100)]

@@ -134,29 +134,21 @@ class ImageQueue:
 
 
 class Recent:
-    """
-    Numbers of the last `WINDOW_S` of wall clock, safe to use from several threads.
+    """Numbers of the last `WINDOW_S` of wall clock, safe to use from several threads."""
 
-    Parameters
-    ----------
-    clock_s : callable
-        Monotonic seconds.
-    """
-
-    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._clock_s = clock_s
-        self._start_s = clock_s()
+    def __init__(self) -> None:
+        self._start_s = time.monotonic()
         self._numbers: deque[tuple[float, float]] = deque(maxlen=_MOST)  # times, s, and values
         self._lock = threading.Lock()
 
     def add(self, value: float) -> None:
         """Add a number that has just arrived."""
         with self._lock:
-            self._numbers.append((self._clock_s(), value))
+            self._numbers.append((time.monotonic(), value))
 
     def rate_hz(self) -> float:
         """Numbers per second in the window, or since the start if that is shorter."""
-        passed_s = min(self._clock_s() - self._start_s, WINDOW_S)
+        passed_s = min(time.monotonic() - self._start_s, WINDOW_S)
         return len(self._values()) / passed_s if passed_s > 0 else 0.0
 
     def median(self) -> float | None:
@@ -171,7 +163,7 @@ class Recent:
     def _values(self) -> list[float]:
         """Numbers in the window; those before it are forgotten."""
         with self._lock:
-            while self._numbers and self._numbers[0][0] < self._clock_s() - WINDOW_S:
+            while self._numbers and self._numbers[0][0] < time.monotonic() - WINDOW_S:
                 self._numbers.popleft()
             return [value for _, value in self._numbers]
 
@@ -181,15 +173,9 @@ class Arrivals:
     Times of the last messages of a stream, safe to use from several threads.
 
     By wall clock, which runs at any speed of a replay and without /clock.
-
-    Parameters
-    ----------
-    clock_s : callable
-        Monotonic seconds.
     """
 
-    def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._clock_s = clock_s
+    def __init__(self) -> None:
         self._times_s: deque[float] = deque(maxlen=_ARRIVALS)
 
     def __bool__(self) -> bool:
@@ -198,7 +184,7 @@ class Arrivals:
 
     def add(self) -> None:
         """Add a message that has just arrived."""
-        self._times_s.append(self._clock_s())
+        self._times_s.append(time.monotonic())
 
     def ended(self, least_s: float) -> str:
         """
@@ -210,7 +196,7 @@ class Arrivals:
         times_s = list(self._times_s)
         if not times_s or times_s[-1] - times_s[0] < least_s:
             return ''
-        longest_s, silent_s = float(np.diff(times_s).max()), self._clock_s() - times_s[-1]
+        longest_s, silent_s = float(np.diff(times_s).max()), time.monotonic() - times_s[-1]
         if silent_s < max(least_s, _LONGER * longest_s):
             return ''
         return f'no message for {silent_s:.0f} s, at most {significant(longest_s, 2)} s before'

@@ -205,7 +205,7 @@ class Inputs:
             entry.arrivals.add()
             if entry.raw:
                 now_ns = self._node.get_clock().now().nanoseconds
-                message = RawMessage(entry.name, received, '', now_ns, memoryview(message))
+                message = RawMessage(entry.name, received, now_ns, memoryview(message))
             entry.callback(message)
 
         entry.subscription = self._node.create_subscription(

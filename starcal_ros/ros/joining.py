@@ -17,6 +17,7 @@ import secrets
 import numpy as np
 
 from starcal_ros.records import Activation, Ensemble, StarObservations
+from starcal_ros.text import counted
 
 HISTORY = 20  # activations kept for roll-back, under 1 MB each
 # Resets that are remembered: a file of 20 kB.  An older reset matters only to a folder that was
@@ -58,9 +59,8 @@ class Kept:
 
     def __str__(self) -> str:
         """Return the numbers of images and activations in words."""
-        images, events = len(self.ensemble.images), len(self.history)
-        ends = ['s' * (count != 1) for count in (images, events)]
-        return f'{images} image{ends[0]} and {events} activation{ends[1]}'
+        images = counted(len(self.ensemble.images), 'image')
+        return f'{images} and {counted(len(self.history), "activation")}'
 
 
 def joined(folder: Kept, memory: Kept, last_event: int) -> Kept:

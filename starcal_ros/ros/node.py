@@ -88,7 +88,7 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
     def destroy_node(self) -> None:
         """Leave the graph too: rclpy keeps the node in it as long as the state machine exists."""
         # First, as rclpy destroys all that depends on a node before its handle: the five services
-        # of the state machine share it, and the last of them that is destroyed ends it.  The
+        # that the state machine has share it, and the last one that is destroyed ends it.  The
         # other order crashed once on Kilted.  In either order Fast DDS of Kilted may not return
         # (some of a thousand ends beside other processes): `end_quietly` then ends the process.
         self._state_machine.destroy_when_not_in_use()

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import time
 from typing import Any
 
@@ -28,16 +27,15 @@ class PrintableLogger(rcutils_logger.RcutilsLogger):
     left out: images that are refused for a week fill no disk.  All are logged at DEBUG.
     """
 
-    def __init__(self, name: str, clock_s: Callable[[], float] = time.monotonic) -> None:
+    def __init__(self, name: str) -> None:
         super().__init__(name)
-        self._clock_s = clock_s
         # By line: messages that it may log, since when, and how many were left out.
         self._left: dict[Any, tuple[float, float, int]] = {}
 
     def log(self, message: str, severity: Any, **options: Any) -> bool:
         """Log a message."""
         if self.get_effective_level() > LoggingSeverity.DEBUG:
-            line, now_s = rcutils_logger.CallerId(), self._clock_s()
+            line, now_s = rcutils_logger.CallerId(), time.monotonic()
             count, since_s, omitted = self._left.get(line, (_AT_ONCE, now_s, 0))
             count = min(count + (now_s - since_s) / _EACH_S, _AT_ONCE)
             if count < 1.0:

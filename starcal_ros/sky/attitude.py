@@ -395,21 +395,7 @@ class Attitude:
     """
     Attitude of the first star tracker at an image, from any star tracker by its mounting.
 
-    The fields have the names of those of `StarObservations`.
-
-    Attributes
-    ----------
-    icrf_from_star_tracker_xyzw : (4,)
-        Orientation of the first star tracker.
-    attitude_gap_s : float
-        Gap between the two samples around the image.
-    star_tracker_rate_rad_s, star_tracker_rate_sigma_rad_s : (3,)
-        Angular rate of the first star tracker in its frame, and its 1-sigma; NaN where it is not
-        known.
-    star_tracker : str
-        Frame of the star tracker that measured the attitude; empty: the first.
-    first_from_star_tracker_xyzw : (4,)
-        Orientation of that star tracker in the frame of the first.
+    The fields are those of `StarObservations` with these names.
     """
 
     icrf_from_star_tracker_xyzw: Floats

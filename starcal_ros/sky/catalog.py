@@ -78,7 +78,6 @@ class MotionSource(IntEnum):
     UNKNOWN_J2000 = 5  # position of about J2000, such as in 2MASS, without a motion
 
 
-UNMOVED = (MotionSource.UNKNOWN, MotionSource.UNKNOWN_J2000)
 # By `MotionSource`, per axis: 1-sigma of a place, mas; its epoch, a Julian year; 1-sigma of the
 # motion, mas a year, NaN for that of a usual star.  Lindegren et al. 2021, van Leeuwen 2007, Hog
 # et al. 2000, Skrutskie et al. 2006; DIFFERENCE as in ``data/ATTRIBUTION.md``.

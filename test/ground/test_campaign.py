@@ -23,7 +23,7 @@ from starcal_ground.bags.reader import read_observations, Topics
 from starcal_ground.cli.main import main
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.fleet import Cameras
-from starcal_ros.pipeline.setup import read_setup
+from starcal_ground.parameter_files import read_setup
 from starcal_ros.records import Calibration, refused_image
 
 pytestmark = pytest.mark.slow

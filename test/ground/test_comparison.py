@@ -19,12 +19,13 @@ from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-foun
 
 from starcal_ground import comparison
 from starcal_ground.comparison import chi_squared, compare
+from starcal_ground.written_files import write_calibration
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
 from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_files import read_calibration, write_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, TemperatureTerms
 
 Compared = Callable[..., tuple[str, dict[str, Any]]]

@@ -20,10 +20,11 @@ from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import Source
 from starcal_ground.cli.arguments import EXIT_REFUSED
 from starcal_ground.diagnosis.bags import refusals
+from starcal_ground.parameter_files import read_setup
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.source_diagnosis import Contents, examine, without_setup
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.pipeline.setup import read_setup, Setup
+from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import Image, refused_image
 
 PARAMS = TINY / 'params.yaml'

@@ -16,10 +16,11 @@ from starcal_ground.mirror import MIRRORED
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.undistortion import straight_camera, undistort_file, undistort_maps
+from starcal_ground.written_files import write_calibration
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.formats.products.product_files import read_calibration, write_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, PIXELS_OF
 
 _ELECTRONS = 1e5  # of a star: its brightest pixel has half of the range of the detector

@@ -196,42 +196,56 @@ def test_a_single_one_has_come_with_the_samples_about_the_image() -> None:
     assert not one.has_come(3100 * MS)
 
 
+class Clock:
+    """Clock set by the test."""
+
+    def __init__(self) -> None:
+        self.now_s = 100.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """Monotonic clock of the queue."""
+    clock = Clock()
+    monkeypatch.setattr('starcal_ros.ros.image_queue.time.monotonic', clock)
+    return clock
+
+
 def test_an_image_waits_for_the_samples_of_its_rate_while_they_come(
-    monkeypatch: pytest.MonkeyPatch,
+    clock: Clock,
 ) -> None:
-    clock_s = [0.0]
-    monkeypatch.setattr('starcal_ros.ros.image_queue.time.monotonic', lambda: clock_s[0])
     one = star_trackers(1)
     send(one, 0, *range(0, 2001, 100))
     assert one.has_come(1050 * MS)  # the next one, due at 2100 ms, is more than a second later
     assert not one.has_come(1150 * MS)
-    clock_s[0] = 2.5  # it has fallen silent
+    clock.now_s += 2.5  # it has fallen silent
     assert one.has_come(1150 * MS)
 
 
-def test_rate_is_right_from_the_start() -> None:
+def test_rate_is_right_from_the_start(clock: Clock) -> None:
     """Before the window is full the rate is over the time since the start."""
-    clock_s = [100.0]
-    recent = Recent(lambda: clock_s[0])
+    recent = Recent()
     assert (recent.rate_hz(), recent.median(), recent.largest()) == (0.0, None, None)
     for k in range(40):
-        clock_s[0] += 0.25
+        clock.now_s += 0.25
         recent.add(float(k))
     assert recent.rate_hz() == pytest.approx(4.0)
     assert (recent.median(), recent.largest()) == (19.5, 39.0)
 
 
-def test_what_is_old_is_forgotten() -> None:
-    clock_s = [100.0]
-    recent = Recent(lambda: clock_s[0])
+def test_what_is_old_is_forgotten(clock: Clock) -> None:
+    recent = Recent()
     recent.add(1000.0)
     for k in range(1, 301):
-        clock_s[0] += 1.0
+        clock.now_s += 1.0
         recent.add(float(k))
     # Those that came 60 s ago to now: 61 of them.
     assert recent.rate_hz() == pytest.approx(61 / WINDOW_S)
     assert (recent.median(), recent.largest()) == (270.0, 300.0)
-    clock_s[0] += WINDOW_S + 1
+    clock.now_s += WINDOW_S + 1
     assert (recent.rate_hz(), recent.median(), recent.largest()) == (0.0, None, None)
 
 
@@ -248,16 +262,15 @@ def test_what_is_old_is_forgotten() -> None:
     ],
 )
 def test_a_stream_has_ended_by_its_own_interval(
-    steps_s: list[float], silent_s: float, words: str
+    clock: Clock, steps_s: list[float], silent_s: float, words: str
 ) -> None:
-    clock_s = [100.0]
-    arrivals = Arrivals(lambda: clock_s[0])
+    arrivals = Arrivals()
     assert not arrivals and not arrivals.ended(5.0)
     arrivals.add()
     for step_s in steps_s:
-        clock_s[0] += step_s
+        clock.now_s += step_s
         arrivals.add()
-    clock_s[0] += silent_s
+    clock.now_s += silent_s
     assert arrivals and arrivals.ended(5.0) == words
     arrivals.add()
     assert not arrivals.ended(5.0)

@@ -92,10 +92,13 @@ def test_unknown_types_are_import_errors() -> None:
             message_class(name)
 
 
-def test_a_line_that_logs_without_end_fills_no_disk(capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_line_that_logs_without_end_fills_no_disk(
+    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Ten images a second are refused for ten minutes; another line logs as ever."""
     now_s = 0.0
-    logger = PrintableLogger('refusing', lambda: now_s)
+    monkeypatch.setattr('starcal_ros.ros.printable_log.time.monotonic', lambda: now_s)
+    logger = PrintableLogger('refusing')
     for k in range(6000):
         now_s = 0.1 * k
         logger.warning(f'image {k} refused')

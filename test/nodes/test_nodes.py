@@ -48,6 +48,7 @@ from starcal_ground.bag_writer import (
 )
 from starcal_ground.bags import reader
 from starcal_ground.cli.main import main
+from starcal_ground.written_files import write_calibration
 from starcal_ros.formats.messages import message_codec
 from starcal_ros.formats.messages.message_codec import make_header, stamp_ns
 from starcal_ros.formats.messages.record_messages import (
@@ -57,11 +58,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_to_message,
 )
 from starcal_ros.formats.messages.sensor_messages import image_from_message
-from starcal_ros.formats.products.product_files import (
-    CALIBRATION_FILE,
-    read_calibration,
-    write_calibration,
-)
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.pipeline import solve as solving
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Image as ImageRecord

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from starcal_ground.bags.player_options import PlayerOptions
+from starcal_ground.parameter_files import read_parameter_file, read_values
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.options import (
@@ -21,10 +22,9 @@ from starcal_ros.options import (
     option,
     option_fields,
     parameter_sections,
-    read_parameter_file,
     section_applies,
 )
-from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, read_values
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 
 
 @dataclass(frozen=True)

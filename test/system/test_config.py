@@ -26,9 +26,10 @@ import yaml
 
 from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ground.cli.main import main
+from starcal_ground.parameter_files import read_parameter_file, read_setup
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.options import check_value, names_of, option_fields, read_parameter_file
-from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES, read_setup
+from starcal_ros.options import check_value, names_of, option_fields
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 
 ROOT = Path(__file__).parents[2]
 CONFIG = ROOT / 'config'

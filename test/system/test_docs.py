@@ -24,9 +24,10 @@ from starcal_ground.cli import main
 from starcal_ground.cli.commands import demo
 from starcal_ground.cli.main import parser
 from starcal_ground.comparison import compare, truth_like
+from starcal_ground.parameter_files import read_parameter_file
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.options import names_of, read_parameter_file
+from starcal_ros.options import names_of
 from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, OPTION_CLASSES
 
 ROOT = Path(__file__).resolve().parents[2]

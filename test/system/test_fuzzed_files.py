@@ -18,19 +18,16 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import reader
 from starcal_ground.cli import main
 from starcal_ground.comparison import compare
+from starcal_ground.parameter_files import NODES, read_parameter_file
 from starcal_ground.products import prior_of
+from starcal_ground.written_files import write_calibration
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
 from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.formats.products.product_files import (
-    CALIBRATION_FILE,
-    read_calibration,
-    write_calibration,
-)
-from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline.setup import load_setup, NODES
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.records import Image
 
 pytestmark = pytest.mark.slow

@@ -28,11 +28,11 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     import numpy as np
 
-    from starcal_ground.mission.ingest.deep_catalog import refusals, write_deep_catalog
+    from starcal_ground.mission.ingest.deep_catalog import refusals, UNMOVED, write_deep_catalog
     from starcal_ground.products import check_outputs
     from starcal_ros.constants import ARCSECOND_RAD
     from starcal_ros.sky.astrometry import julian_year
-    from starcal_ros.sky.catalog import load_catalog, UNMOVED
+    from starcal_ros.sky.catalog import load_catalog
 
     output = args.output if args.output.suffix == '.npz' else Path(f'{args.output}.npz')
     check_outputs([output], [args.table])

@@ -69,8 +69,8 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.images.image_series import ImageOptions
     from starcal_ground.images.photographs import images_of
     from starcal_ground.mission.ingest import mission_records, recording, sources
+    from starcal_ground.products import inputs_of
     from starcal_ros.formats.products.camera_yaml import read_camera_info
-    from starcal_ros.pipeline.solve import inputs_of
 
     needed = 4 * (1 + len(args.more_star_trackers))
     given = len(args.alignment)

@@ -62,7 +62,7 @@ def write_lookup_table(table: LineOfSightTable, path: Path, has_alignment: bool 
     """
     import numpy as np
 
-    from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ground.written_files import write_atomically
 
     columns: dict[str, Any] = table.columns()  # the stub of savez_compressed wants no others
     if not has_alignment:

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.campaign import calibrate, chosen, observe
     from starcal_ground.images.first_setup import source_of
     from starcal_ground.planning.plan import Cone, plan_pointings, PlanRequest
-    from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ground.written_files import write_atomically
 
     given = arguments.given(args)
     _, stated = given.checked

@@ -170,7 +170,7 @@ def export(calibration: Calibration, kind: str, folder: Path, asked: Request) ->
     as `check_outputs` does.
     """
     from starcal_ground.products import check_outputs
-    from starcal_ros.formats.products.product_files import write_atomically
+    from starcal_ground.written_files import write_atomically
 
     row = format_named(kind)
     if asked.table and not row.has_table:

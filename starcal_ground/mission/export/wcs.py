@@ -34,8 +34,7 @@ from starcal_ros.assessment.lookup import detector_sight, line_of_sight_sigma_ar
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import needing, ProductError
-from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Calibration, ORIGINAL, StarObservations
+from starcal_ros.records import Calibration, ORIGINAL, StarObservations, TIMES
 from starcal_ros.sky.astrometry import julian_year
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 

@@ -23,14 +23,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcal_ground.mission.ingest.mission_records import Guard
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, IngestError, needing
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.robust_statistics import median
 from starcal_ros.sky import catalog as sky_catalog
 from starcal_ros.sky.catalog import MotionSource
 from starcal_ros.untrusted import regular_file, shown
+
+UNMOVED = (MotionSource.UNKNOWN, MotionSource.UNKNOWN_J2000)
 
 
 def johnson_v(g: Floats, bp_rp: Floats) -> Floats:
@@ -186,7 +188,7 @@ def deep_catalog(path: Path) -> DeepCatalog:
     pairs = close_pairs(_direction(values))
     values['close_pair'] = marked_close(pairs, values['magnitude'])
     values['close_pair'][int(new.sum()) :] |= bundled.close_pair[kept]
-    unmoved = np.isin(stars['motion_source'], sky_catalog.UNMOVED)
+    unmoved = np.isin(stars['motion_source'], UNMOVED)
     return DeepCatalog(
         integer_columns(values),
         table.source,

@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from starcal_ground import products
+from starcal_ground import products, written_files
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.reader import IMAGE_FILE
 from starcal_ground.images import image_series
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
+from starcal_ground.products import input_name
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import IngestError
 from starcal_ros.formats.products import product_files
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.pipeline.solve import input_name
 from starcal_ros.records import Image, ORIGINAL, PIXELS_OF
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.untrusted import PARAMETER_BYTES
@@ -170,9 +170,9 @@ def write_bag(
         trackers |= {f'/{frame}/attitude': other for frame, other in others.items()}
         _write_messages(writer, files, options, scale, guard, trackers, velocities, on_image)
         # Just before the bag replaces an older one; the record first, which marks it as ours.
-        product_files.write_atomically(record, json.dumps(content, indent=1) + '\n')
+        written_files.write_atomically(record, json.dumps(content, indent=1) + '\n')
         for path, text in prior_files.items():
-            product_files.write_atomically(path, text)
+            written_files.write_atomically(path, text)
     return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 

@@ -34,12 +34,13 @@ from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import chosen, observe, Source
 from starcal_ground.images.first_setup import air_of
 from starcal_ground.mission.trend.trend_table import COMPUTED, FAILED, RECORDED, Row, Table
+from starcal_ground.parameter_files import read_setup
 from starcal_ground.source_diagnosis import calibrated
 from starcal_ros import processes, untrusted
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
-from starcal_ros.pipeline.setup import files_of, read_setup
+from starcal_ros.pipeline.setup import files_of
 from starcal_ros.records import Calibration, StarObservations
 from starcal_ros.text import printable
 

@@ -14,10 +14,10 @@ from starcal_ground.mission.trend import series as trends
 from starcal_ground.mission.trend.series import Change, Series, Term
 from starcal_ground.mission.trend.trend_table import Row
 from starcal_ground.report import page, svg
+from starcal_ground.written_files import write_atomically
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.requirements import requirement_answers
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.text import printable, significant
 
 TREND_FILE = 'trend.html'

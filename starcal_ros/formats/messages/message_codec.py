@@ -30,9 +30,8 @@ flat numpy arrays of the field's type.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 import math
-from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -67,25 +66,12 @@ _ENTRIES = {int: ('ReasonCount', 'reason', 'count'), str: ('KeyValue', 'key', 'v
 
 @dataclass(frozen=True)
 class RawMessage:
-    """
-    A message as recorded or received.
-
-    ``view`` is serialised CDR with its header, ``definition`` that of its type in the bag;
-    ``place`` is its file, the offset of its chunk there, or its own, and its number in the chunk;
-    None where the reader does not know it.
-    """
+    """A message as received or recorded; ``view`` is serialised CDR with its header."""
 
     topic: str
     type_name: str
-    definition: str
     log_time_ns: int
     view: memoryview
-    place: tuple[Path, int, int] | None = field(default=None, compare=False)
-
-    @property
-    def data(self) -> bytes:
-        """A copy of the message as bytes, because middleware does not accept a view."""
-        return bytes(self.view)
 
 
 class Make(Protocol):

@@ -26,10 +26,10 @@ from starcal_ros.records import Image, LEAST_DEGC, MOST_DEGC, refused_image, Sta
 
 MOST_PIXELS = 2**27  # the largest image takes 256 MB at 16 bit
 _SET_CHANNEL = 'is a colour image: set image_channel, e.g. to green'
-_PIXEL_BYTES = {'mono8': 1, '8UC1': 1, 'mono16': 2, '16UC1': 2}
 CHANNELS = ('red', 'green', 'blue')
 
 # Encodings of sensor_msgs/image_encodings: the letters of their channels, and bytes per channel.
+_GREY_ENCODINGS = {'mono8': ('', 1), '8UC1': ('', 1), 'mono16': ('', 2), '16UC1': ('', 2)}
 RGB_ENCODINGS = {
     f'{letters}{bits}': (letters, bits // 8)
     for letters in ('rgb', 'bgr', 'rgba', 'bgra')
@@ -40,6 +40,7 @@ BAYER_ENCODINGS = {
     for letters in ('rggb', 'bggr', 'gbrg', 'grbg')
     for bits in (8, 16)
 }
+_ENCODINGS = {**_GREY_ENCODINGS, **RGB_ENCODINGS, **BAYER_ENCODINGS}
 _PNG_START = b'\x89PNG\r\n\x1a\n\0\0\0\rIHDR'
 _PNG_HEADER_BYTES = 33
 _PNG_CHUNK = struct.Struct('>I4s')  # length, name
@@ -63,17 +64,14 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
     """
     encoding, width, height, step = message.encoding, message.width, message.height, message.step
     data = message.data
-    is_colour = encoding in RGB_ENCODINGS or encoding in BAYER_ENCODINGS
-    if is_colour and not channel:
-        raise ImageRefused('bad_encoding', f'{encoding} {_SET_CHANNEL}')
-    letters, pixel_bytes = RGB_ENCODINGS.get(encoding, ('', 0))
-    if not letters:
-        pixel_bytes = _PIXEL_BYTES.get(encoding) or BAYER_ENCODINGS.get(encoding, ('', 0))[1]
-    if not pixel_bytes:
+    if encoding not in _ENCODINGS:
         raise ImageRefused(
-            'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_PIXEL_BYTES)}'
+            'bad_encoding', f'{encoding[:40]!r} is not one of {", ".join(_GREY_ENCODINGS)}'
         )
-    channels = max(len(letters), 1)
+    letters, pixel_bytes = _ENCODINGS[encoding]
+    if letters and not channel:
+        raise ImageRefused('bad_encoding', f'{encoding} {_SET_CHANNEL}')
+    channels = len(letters) if encoding in RGB_ENCODINGS else 1
     # An empty buffer has no shape that frombuffer would take.
     flat = np.frombuffer(data, np.uint8) if len(data) else np.empty(0, np.uint8)
     row_bytes = width * pixel_bytes * channels
@@ -93,9 +91,9 @@ def decode_image(message: codec.Message, time_ns: int, channel: str = '') -> Ima
         buffer=flat,
         strides=(step, pixel_bytes * channels, pixel_bytes),
     )
-    rows = plane(rows, letters, channel) if letters else rows[:, :, 0]
+    rows = plane(rows, letters, channel) if encoding in RGB_ENCODINGS else rows[:, :, 0]
     if encoding in BAYER_ENCODINGS:
-        rows = of_mosaic(rows, BAYER_ENCODINGS[encoding][0], channel)
+        rows = of_mosaic(rows, letters, channel)
     pixels: AnyArray = np.ascontiguousarray(rows, dtype.newbyteorder('='))
     pixels.setflags(write=False)
     return Image(time_ns, pixels)

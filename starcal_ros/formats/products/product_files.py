@@ -21,7 +21,7 @@ import numpy as np
 from starcal_ros import untrusted
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.files import replacing, sealed
+from starcal_ros.files import replacing
 from starcal_ros.record_fields import Count, Finite, json_object, Quaternion, read_record
 from starcal_ros.records import ALIGNMENT_NAMES, Calibration, CameraGeometry, check_calibration
 from starcal_ros.untrusted import shown
@@ -51,12 +51,11 @@ def write_atomically(path: Path, content: str | bytes) -> None:
     """
     Replace a file whole: readers, and a power loss, see the old one or the new one.
 
-    An HTML page is sealed.  Raises ProductError when the file cannot be written; the old one is
-    then unchanged.
+    Raises ProductError when the file cannot be written; the old one is then unchanged.
     """
     data = content.encode() if isinstance(content, str) else content
     with errors_as(ProductError, path, 'written'), replacing(path) as file:
-        file.write(sealed(data) if path.suffix == '.html' else data)
+        file.write(data)
 
 
 @dataclass(frozen=True)
@@ -123,11 +122,6 @@ class ActiveFile:
     events: Count
     active: str
     withdrawn: tuple[str, ...] = ()
-
-
-def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Write ``calibration.json``, NaN and infinity as null; raises ProductError if it cannot."""
-    write_atomically(path, calibration_text(calibration))
 
 
 def check_readable(calibration: Calibration) -> None:

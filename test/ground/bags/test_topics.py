@@ -18,6 +18,7 @@ from starcal_ground.bags import reader, topics
 from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import Source
 from starcal_ground.cli.main import main
+from starcal_ground.parameter_files import NODES, read_parameter_file, read_setup
 from starcal_ground.simulation.simulated_bag import IMAGE_TOPIC
 from starcal_ros.errors import BagError
 from starcal_ros.formats.bag.typestore import make_message
@@ -28,8 +29,7 @@ from starcal_ros.formats.messages.message_codec import (
     POSE_TYPE,
 )
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline.setup import load_setup, NODES, read_setup, Setup
+from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image
 
 

@@ -22,7 +22,7 @@ import pytest
 
 from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
-from starcal_ros.formats.products.product_files import write_atomically
+from starcal_ground.written_files import write_atomically
 
 pytestmark = pytest.mark.slow
 

@@ -32,9 +32,9 @@ from starcal_ground.cli.arguments import EXIT_INTERRUPTED
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros import files
+from starcal_ground.written_files import is_marked, write_atomically
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.products.product_files import read_calibration, write_atomically
+from starcal_ros.formats.products.product_files import read_calibration
 
 pytestmark = pytest.mark.slow
 
@@ -223,7 +223,7 @@ def _reads(path: Path) -> bool:
             Table(path.parent).rows()
         elif path.suffix == '.html':
             with path.open('rb') as page:
-                return files.is_marked(page)
+                return is_marked(page)
         else:
             return path.stat().st_size > 0
     except (StarcalError, ValueError, OSError):

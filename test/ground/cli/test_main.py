@@ -25,8 +25,8 @@ from starcal_ground.cli import main, node_processes
 from starcal_ground.cli.arguments import EXIT_INTERRUPTED, parse_time, Selection
 from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import COMMANDS, parser
+from starcal_ground.written_files import write_atomically
 from starcal_ros.constants import software_version
-from starcal_ros.formats.products.product_files import write_atomically
 
 
 def test_no_command_prints_the_help(starcal) -> None:

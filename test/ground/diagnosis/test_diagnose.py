@@ -21,11 +21,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from starcal_ground.bags import reader
 from starcal_ground.diagnosis.attitude_readings import WireAttitudes
 from starcal_ground.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
+from starcal_ground.parameter_files import read_setup
 from starcal_ground.simulation import rendering
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ros.camera import CameraModel
 from starcal_ros.formats.messages.sensor_messages import attitude_from_message
-from starcal_ros.pipeline.setup import load_setup, read_setup, Setup
+from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import CameraGeometry, Image
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import load_catalog, StarCatalog

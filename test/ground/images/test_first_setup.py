@@ -13,8 +13,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from starcal_tool import assert_refused  # type: ignore[import-not-found]
 
+from starcal_ground.parameter_files import read_setup
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.pipeline.setup import read_setup
 
 TRUTH = json.loads((TINY / 'truth.json').read_text())
 ATTITUDES = '/star_tracker/attitude'

@@ -43,8 +43,7 @@ from starcal_ros.arrays import Pixels
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.errors import NotFromStars
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Image, PIXELS_OF, refused_image
+from starcal_ros.records import Image, PIXELS_OF, refused_image, TIMES
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.catalog import load_catalog
 

@@ -30,13 +30,9 @@ from starcal_ground.report import page as report
 from starcal_ground.report import svg
 from starcal_ground.report.page import write_failure_page, write_report
 from starcal_ground.report.svg import light
-from starcal_ros.formats.products.product_files import (
-    CALIBRATION_FILE,
-    read_calibration,
-    write_calibration,
-)
-from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Activation, Calibration, Ensemble
+from starcal_ground.written_files import write_calibration
+from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
+from starcal_ros.records import Activation, Calibration, Ensemble, TIMES
 from starcal_ros.ros.archive import Archive
 from starcal_ros.text import significant
 

@@ -13,19 +13,14 @@ import pytest
 from tiny_campaign import attitudes, image, SCENARIO, values, write_png  # type: ignore[import-not-found]
 
 from bench.narrow import scenario_of
+from starcal_ground.parameter_files import read_setup
 from starcal_ground.products import write_camera_info
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.detector_frames import flattened
-from starcal_ros.pipeline.setup import (
-    check_field_of_stars,
-    load_setup,
-    OPTION_CLASSES,
-    read_setup,
-    Setup,
-)
+from starcal_ros.pipeline.setup import check_field_of_stars, load_setup, OPTION_CLASSES, Setup
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
 

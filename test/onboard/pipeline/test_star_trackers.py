@@ -16,10 +16,10 @@ from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import topics
 from starcal_ground.bags.reader import log_damage
 from starcal_ground.bags.topics import Topics
+from starcal_ground.parameter_files import NODES, read_parameter_file
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError
-from starcal_ros.options import read_parameter_file
-from starcal_ros.pipeline.setup import load_setup, NODES, Setup
+from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import StarObservations
 
 FIRST_FROM_OTHER = Rotation.from_euler('xyz', [100.0, -20.0, 35.0], degrees=True)

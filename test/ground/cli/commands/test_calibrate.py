@@ -24,8 +24,8 @@ from starcal_ground.products import (
     OBSERVATIONS_TOPIC,
     write_observations,
 )
+from starcal_ground.written_files import write_atomically
 from starcal_ros.camera.projection import convert
-from starcal_ros.formats.products.product_files import write_atomically
 from starcal_ros.records import FOUND, refused_image, SigmaPart
 
 

@@ -10,7 +10,7 @@ from export_calibrations import calibration  # type: ignore[import-not-found]
 import pytest
 import spiceypy
 
-from starcal_ros.formats.products.product_files import write_calibration
+from starcal_ground.written_files import write_calibration
 
 
 @pytest.fixture

@@ -20,6 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
 from starcal_ground.mission.export.export_formats import export, Request
+from starcal_ground.written_files import write_calibration
 from starcal_ros.assessment.lookup import (
     common_rotation,
     Derivatives,
@@ -30,7 +31,6 @@ from starcal_ros.assessment.lookup import (
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.estimation.problem import camera_at
-from starcal_ros.formats.products.product_files import write_calibration
 from starcal_ros.records import Calibration, factored_field, MapCovariance, SigmaPart
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]  # compilers run

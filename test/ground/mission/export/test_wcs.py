@@ -24,8 +24,7 @@ from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.pipeline.solve import TIMES
-from starcal_ros.records import Calibration, StarObservations, TemperatureTerms
+from starcal_ros.records import Calibration, StarObservations, TemperatureTerms, TIMES
 from starcal_ros.sky.catalog import load_catalog
 
 

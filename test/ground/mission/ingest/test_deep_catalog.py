@@ -20,11 +20,12 @@ from starcal_tool import assert_refused  # type: ignore[import-not-found]
 from starcal_ground.mission.ingest.deep_catalog import (
     deep_catalog,
     integer_columns,
+    UNMOVED,
     write_deep_catalog,
 )
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, StarcalError
-from starcal_ros.sky.catalog import load_catalog, MotionSource, StarCatalog, UNMOVED
+from starcal_ros.sky.catalog import load_catalog, MotionSource, StarCatalog
 
 # A child process reads each table.
 pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('forked_readers')]

@@ -31,7 +31,7 @@ from starcal_ground.bags import reader
 from starcal_ground.bags.frames import read_telemetry
 from starcal_ground.bags.reader import Topics
 from starcal_ros.constants import utc_text
-from starcal_ros.records import Image
+from starcal_ros.records import Image, ORIGINAL, PIXELS_OF
 
 pytestmark = pytest.mark.usefixtures('forked_readers')
 
@@ -213,12 +213,13 @@ def test_originals_and_pixels_of_imported_bags_are_in_every_product_made_from_th
         files = (folder / '*.fits',)
         flipped = [*prior, '--alignment', *ALIGNMENT, '--flip', 'top-bottom']
         assert run(aem, *files, bag=tmp_path / name, more=flipped).status == 0
-    pixels_of, originals = reader.origin_of([tmp_path / 'one', tmp_path / 'two'])
-    assert pixels_of == 'mirrored top to bottom (--flip)'
+    originals = reader.origin_of([tmp_path / 'one', tmp_path / 'two'])
+    assert originals.pop(PIXELS_OF) == 'mirrored top to bottom (--flip)'
     names = [str(tmp_path / 'night' / f'{k}.fits') for k in range(5)]
-    assert {*originals} == {*names, *(f'{name} (of another bag)' for name in names), str(aem)}
+    inputs = {*names, *(f'{name} (of another bag)' for name in names), str(aem)}
+    assert {*originals} == {f'{ORIGINAL}{name}' for name in inputs}
     assert len({*originals.values()}) == 11
-    assert reader.origin_of([TINY]) == ('', {})
+    assert not reader.origin_of([TINY])
 
 
 @pytest.mark.slow

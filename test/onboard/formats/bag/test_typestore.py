@@ -23,11 +23,7 @@ from starcal_ros.formats.bag.typestore import (
     typestore,
     typestore_of,
 )
-from starcal_ros.formats.messages.message_codec import (
-    CALIBRATION_TYPE,
-    OBSERVATIONS_TYPE,
-    RawMessage,
-)
+from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE, OBSERVATIONS_TYPE
 from starcal_ros.formats.messages.record_messages import (
     checked_observations,
     observations_to_message,
@@ -69,7 +65,7 @@ def test_the_definitions_of_versions_are_taken(type_name: str, more: str) -> Non
 def test_others_are_refused(definition: str, why: str) -> None:
     with pytest.raises(Exception, match=why):
         check_definition(OBSERVATIONS_TYPE, definition)
-    raw = RawMessage('/o', OBSERVATIONS_TYPE, definition, 0, memoryview(b''))
+    raw = reader.RecordedMessage('/o', OBSERVATIONS_TYPE, 0, memoryview(b''), definition)
     for read in (reader.decode, reader.cdr_of_this_version):
         with pytest.raises(BagError, match=f'^/o: .* as no version of starcal does: .*{why}'):
             read(raw)
@@ -101,7 +97,7 @@ def test_a_message_of_another_version_is_read_and_has_zeros_for_ros(lacking: str
     others = {name: getattr(message, name) for name in FIELDS if name != lacking}
     older = store.types[OBSERVATIONS_TYPE](**others, later=0.5)
     data = memoryview(store.serialize_cdr(older, OBSERVATIONS_TYPE))
-    raw = RawMessage('/observations', OBSERVATIONS_TYPE, definition, 0, data)
+    raw = reader.RecordedMessage('/observations', OBSERVATIONS_TYPE, 0, data, definition)
     zero = zeroed(getattr(message, lacking), f'[] {lacking}\n' in now)
     with_zero = serialised('', OBSERVATIONS_TYPE, replace(message, **{lacking: zero}))
     assert reader.cdr_of_this_version(raw) == with_zero

@@ -271,7 +271,7 @@ def test_a_serialised_image_is_viewed_as_rosbags_reads_it(
     }
     whole = bytes(typestore().serialize_cdr(kinds[type_name], type_name, little_endian=little))
     expected: Any = typestore().deserialize_cdr(whole, type_name)
-    message = view_image(RawMessage('/image', type_name, '', 5, memoryview(whole)))
+    message = view_image(RawMessage('/image', type_name, 5, memoryview(whole)))
     assert vars(message.header.stamp) == {
         name: getattr(expected.header.stamp, name) for name in ('sec', 'nanosec')
     }
@@ -281,11 +281,11 @@ def test_a_serialised_image_is_viewed_as_rosbags_reads_it(
         assert getattr(message, name, None) == getattr(expected, name, None)
     # Truncated anywhere, it is refused with the time of its arrival; more behind it is not read.
     for size in range(len(whole)):
-        record = image_of(RawMessage('/image', type_name, '', 5, memoryview(whole[:size])))
+        record = image_of(RawMessage('/image', type_name, 5, memoryview(whole[:size])))
         assert isinstance(record, StarObservations)
         assert (record.refusal, record.time_ns) == ('bad_layout', 5)
         assert record.detail == f'/image: {size} bytes are no {type_name}'
-    more = image_of(RawMessage('/image', type_name, '', 5, memoryview(whole + bytes(9))))
+    more = image_of(RawMessage('/image', type_name, 5, memoryview(whole + bytes(9))))
     assert isinstance(more, Image) and more.time_ns == TIME_NS
 
 

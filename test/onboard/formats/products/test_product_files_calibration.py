@@ -13,11 +13,12 @@ import numpy as np
 import pytest
 from sample_records import assert_same, calibration, plain_calibration, without_field  # type: ignore[import-not-found]
 
+from starcal_ground.written_files import write_calibration
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.bag.typestore import make_message, typestore
 from starcal_ros.formats.messages.message_codec import CALIBRATION_TYPE
 from starcal_ros.formats.messages.record_messages import calibration_to_message
-from starcal_ros.formats.products.product_files import read_calibration, write_calibration
+from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import GateCheck, TemperatureTerms
 
 GATE = (

@@ -11,14 +11,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 import math
 import re
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-
-class Card(NamedTuple):
-    """Value and comment of a FITS keyword."""
-
-    value: Any
-    comment: str = ''
+from starcal_ros.formats.image_files import Card, REGION, ROW_ORDER, WITHOUT_LIGHT
 
 
 class Fact(NamedTuple):
@@ -56,12 +51,12 @@ FACTS: Mapping[str, Fact] = {
         ('XPOSURE', 'EXPTIME', 'EXPOSURE', 'EXP_TIME', 'EXPT', 'ITIME'), 's', 'positive',
         0.0, 86400.0,
     ),
-    'order of the rows': Fact(('ROWORDER',), '', 'the stars, if mirrored'),
+    'order of the rows': Fact(ROW_ORDER, '', 'the stars, if mirrored'),
     'mosaic': Fact(('BAYERPAT', 'COLORTYP', 'CFAPAT'), '', 'levels of the four colours'),
     'first column in the mosaic': Fact(('XBAYROFF', 'BAYOFFX'), 'px', 'as the mosaic'),
     'first row in the mosaic': Fact(('YBAYROFF', 'BAYOFFY'), 'px', 'as the mosaic'),
-    'region of the image': Fact(('TRIMSEC', 'DATASEC'), '', _INSIDE),
-    'region without light': Fact(('BIASSEC',), '', 'a strip along an edge'),
+    'region of the image': Fact(REGION, '', _INSIDE),
+    'region without light': Fact(WITHOUT_LIGHT, '', 'a strip along an edge'),
     'focal length': Fact(('FOCALLEN', 'FOCALLENGTH', 'FOCAL'), 'mm', _TRIED, 0.1, 1e6),
     'pixel size': Fact(
         ('XPIXSZ', 'PIXSIZE1', 'XPIXELSZ', 'PIXSIZE', 'CCDXPIXE'), 'um', _TRIED, 0.1, 1000.0
