@@ -104,7 +104,9 @@ def test_calibrates_through_the_icd(vehicle: Vehicle) -> None:
     diagnostics = vehicle.collect(DiagnosticArray, '/diagnostics')
     names = {f'starcal: {name}' for name in BOTH}
     vehicle.until(lambda: names <= {m.status[0].name for m in diagnostics})
-    assert {m.status[0].level for m in diagnostics} == {b'\x00'}
+    # The bag is over: where it took ten seconds to send, the nodes report that too.
+    doubts = [m.status[0].message for m in diagnostics if m.status[0].level != b'\x00']
+    assert all(': no message for ' in doubt for doubt in doubts), doubts
 
 
 def check_products(info: Any, alignment: Any, calibration: Any, folder: Path) -> None:
