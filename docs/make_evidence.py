@@ -22,7 +22,7 @@ from scipy.special import erf
 
 from bench.table import Table
 from starcal_ground.report import page, svg
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Floats
 from studies.trials import rms
 
@@ -271,7 +271,7 @@ def write(path: Path, before: Path | None = None) -> list[Table]:
     content = {'tables': shown, 'charts': charts(rows, old), 'count': len(rows)}
     digests = [some[-1]['digest'] for some in (old, rows) if some]
     text = environment.get_template('evidence.html').render(**content, digests=digests)
-    write_atomically(path.with_suffix('.html'), text)
+    write_marked(path.with_suffix('.html'), text)
     return made
 
 

@@ -83,7 +83,7 @@ def write_camera_info(
     ``pixels_of`` says which pixels of image files are those of the camera, as a comment.
     """
     comment = f'# {PIXELS_OF}: {pixels_of}\n' if pixels_of else ''
-    written_files.write_atomically(path, comment + camera_info_text(camera, camera_name))
+    written_files.write_marked(path, comment + camera_info_text(camera, camera_name))
 
 
 def camera_info_text(camera: CameraModel, camera_name: str) -> str:
@@ -159,7 +159,7 @@ def write_residuals(residuals: Residuals, path: Path) -> None:
             np.save(file := io.BytesIO(), column, allow_pickle=False)
             # A name alone would get the time of the clock: each run writes the same bytes.
             archive.writestr(zipfile.ZipInfo(f'{name}.npy'), file.getvalue(), kind, 1)
-    written_files.write_atomically(path, memory.getvalue())
+    written_files.write_marked(path, memory.getvalue())
 
 
 def read_residuals(path: Path) -> Residuals:
@@ -230,9 +230,7 @@ def reasons_in_words(refused: Mapping[str, int]) -> str:
 def write_not_calibrated(record: NotCalibrated, folder: Path) -> None:
     """Write the record of a failure and remove earlier products; raises ProductError."""
     content = {'calibrated': False, **record_fields.json_object(record)}
-    written_files.write_atomically(
-        folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n'
-    )
+    written_files.write_marked(folder / NOT_CALIBRATED_FILE, json.dumps(content, indent=1) + '\n')
     for name in (product_files.CALIBRATION_FILE, CAMERA_INFO_FILE, RESIDUALS_FILE, REPORT_FILE):
         with errors_as(ProductError, folder / name, 'removed'):
             (folder / name).unlink(missing_ok=True)

@@ -17,7 +17,7 @@ import numpy as np
 
 from starcal_ground.fits_images import read_fits
 from starcal_ground.mirror import flips_in, mirrored
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Singles
 from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.errors import IngestError
@@ -110,4 +110,4 @@ def undistort_file(
     # Lanczos moves a star by 0.006 px rms, the cubic and the linear kernel by 0.015.
     straight = cv2.remap(np.ascontiguousarray(values), *maps, cv2.INTER_LANCZOS4)
     _, content = cv2.imencode(output.suffix, straight)
-    write_atomically(output, content.tobytes())
+    write_marked(output, content.tobytes())

@@ -33,12 +33,11 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
         mark(file)
 
 
-def write_atomically(path: Path, content: str | bytes) -> None:
+def write_marked(path: Path, content: str | bytes) -> None:
     """
-    Replace a file whole: readers, and a power loss, see the old one or the new one.
+    Replace a file whole as by `replacing`, and seal an HTML page.
 
-    An HTML page is sealed.  Raises ProductError when the file cannot be written; the old one is
-    then unchanged.
+    Raises ProductError when the file cannot be written; the old one is then unchanged.
     """
     data = content.encode() if isinstance(content, str) else content
     with errors_as(ProductError, path, 'written'), replacing(path) as file:
@@ -50,7 +49,7 @@ def write_calibration(calibration: Calibration, path: Path) -> None:
     # The help of the tool imports this module, and needs no numerics.
     from starcal_ros.formats.products.product_files import calibration_text
 
-    write_atomically(path, calibration_text(calibration))
+    write_marked(path, calibration_text(calibration))
 
 
 def mark(file: IO[bytes]) -> None:

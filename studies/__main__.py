@@ -21,7 +21,7 @@ from starcal_ground.cli import terminal
 from starcal_ground.cli.arguments import number
 from starcal_ground.products import make_folder
 from starcal_ground.simulation.scenario import scenario
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.constants import software_version
 from starcal_ros.errors import OptionError, StarcalError
 from starcal_ros.estimation.problem import METHODS
@@ -97,7 +97,7 @@ def _monte_carlo(args: argparse.Namespace) -> None:
     start_s = time.monotonic()
     result = monte_carlo.conclude(design, _rows(design, args))
     path = args.output / f'{design.study}.json'
-    write_atomically(path, monte_carlo.content(result, _software()))
+    write_marked(path, monte_carlo.content(result, _software()))
     print(
         f'{design.study}: {title}; {design.trials} trials, seed {design.seed},'
         f' {time.monotonic() - start_s:.1f} s'
@@ -136,11 +136,11 @@ def _paper(args: argparse.Namespace) -> None:
         observations, monte_carlo.conclude(table1, _rows(table1, args)), args.seed
     )
     for name, svg in paper.svgs(result).items():
-        write_atomically(args.output / 'images' / f'paper_{name}.svg', svg)
+        write_marked(args.output / 'images' / f'paper_{name}.svg', svg)
     path = args.output / 'paper.md'
-    write_atomically(path, paper.page(result, _software()))
+    write_marked(path, paper.page(result, _software()))
     content = {'software': _software(), **paper.numbers(result)}
-    write_atomically(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
+    write_marked(path.with_suffix('.json'), json.dumps(content, indent=1) + '\n')
     print(f'written to {path}, with figures in {args.output / "images"}')
 
 

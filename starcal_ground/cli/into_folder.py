@@ -112,7 +112,7 @@ def calibrate_into(
             with drawings.kind('report'):
                 page, report = _drawn(made, pictures, folder)
         if page:
-            written_files.write_atomically(path, page)
+            written_files.write_marked(path, page)
         else:  # one that is there is of the products that were replaced
             path.unlink(missing_ok=True)
         written.result()

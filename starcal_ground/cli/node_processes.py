@@ -77,12 +77,12 @@ def calibrate_with_nodes(
     """
     import yaml
 
-    from starcal_ground.written_files import write_atomically
+    from starcal_ground.written_files import write_marked
     from starcal_ros.formats.products.product_files import read_calibration
 
     params, *_ = outputs(folder)
     content = {'/**': {'ros__parameters': dict(parameters)}}
-    write_atomically(params, yaml.safe_dump(content, sort_keys=False))
+    write_marked(params, yaml.safe_dump(content, sort_keys=False))
     own_domain = {} if 'ROS_DOMAIN_ID' in os.environ else free_domain()
     environment = {**os.environ, **own_domain}
     with contextlib.ExitStack() as stack:

@@ -34,7 +34,7 @@ from starcal_ground.campaign import Source, ThroughAir
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.images.photographs import image_paths, NOT_STATED
 from starcal_ground.products import make_folder, write_camera_info
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.errors import BagError, OptionError
 from starcal_ros.estimation.options import tracker_sigma_is_given
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE
@@ -161,7 +161,7 @@ def write_setup(source: Source, stated: Mapping[str, object], folder: Path) -> N
     make_folder(folder)
     pixels_of = setup.origin.get(PIXELS_OF, '')
     write_camera_info(setup.prior.camera, folder / CAMERA_FILE, pixels_of=pixels_of)
-    write_atomically(folder / PARAMETER_FILE, content)
+    write_marked(folder / PARAMETER_FILE, content)
 
 
 def assumed(

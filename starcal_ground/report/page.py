@@ -137,7 +137,7 @@ def write_report(folder: Path) -> Path:
     if failure is not None:
         return write_failure_page(failure, folder)
     path = folder / products.REPORT_FILE
-    written_files.write_atomically(path, render(_read_folder(folder), folder))
+    written_files.write_marked(path, render(_read_folder(folder), folder))
     return path
 
 
@@ -245,7 +245,7 @@ def write_failure_page(record: products.NotCalibrated, folder: Path) -> Path:
     pictures = thumbnails.read_thumbnails(folder / thumbnails.THUMBNAILS_FOLDER)
     text = page_template('failure.html').render(record=record, pictures=pictures)
     path = folder / products.REPORT_FILE
-    written_files.write_atomically(path, text)
+    written_files.write_marked(path, text)
     return path
 
 

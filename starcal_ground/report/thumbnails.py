@@ -14,7 +14,7 @@ import numpy as np
 
 from starcal_ground.blind.bright_sources import bright_sources
 from starcal_ground.products import make_folder
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, ProductError
 from starcal_ros.identification.prediction import predict, within_image
@@ -128,7 +128,7 @@ def write_thumbnails(thumbnails: Iterable[Thumbnail], folder: Path) -> None:
         with errors_as(ProductError, path, 'removed'):
             path.unlink()
     for thumbnail in thumbnails:
-        write_atomically(folder / thumbnail.name, thumbnail.encoded)
+        write_marked(folder / thumbnail.name, thumbnail.encoded)
 
 
 def thumbnails_in(folder: Path) -> list[Path]:

@@ -24,7 +24,7 @@ from starcal_ground.mirror import mirrored
 from starcal_ground.simulation import centroids
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation.rendering import images
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, SPEED_OF_LIGHT_M_S
@@ -241,11 +241,11 @@ def write_bag(
                 _write_telemetry(writer, sample, mistakes)
             on_image(index)
         # Just before the bag replaces an older one, so that all files are replaced together.
-        write_atomically(truth, truth_text)
+        write_marked(truth, truth_text)
         products.write_camera_info(scenario.prior.camera, camera, 'opnav')
         if scenario.table is not None:
-            write_atomically(table, scenario.table)
-        write_atomically(params, products.yaml_text(content))
+            write_marked(table, scenario.table)
+        write_marked(params, products.yaml_text(content))
     return SimulatedBag(path, truth, params, camera)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from starcal_ground.written_files import is_marked, mark, replacing, write_atomically
+from starcal_ground.written_files import is_marked, mark, replacing, write_marked
 
 
 def test_a_file_is_known_until_it_is_changed(tmp_path: Path) -> None:
@@ -47,7 +47,7 @@ def test_a_page_is_known_where_a_file_system_keeps_no_attributes(
     monkeypatch.setattr(os, 'setxattr', unsupported)
     monkeypatch.setattr(os, 'getxattr', unsupported)
     for text in ('<html></html>\n', ''):
-        write_atomically(tmp_path / name, text)
+        write_marked(tmp_path / name, text)
         with (tmp_path / name).open('r+b') as file:
             file.seek(0, os.SEEK_END)
             file.write(change)

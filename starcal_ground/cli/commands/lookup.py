@@ -62,7 +62,7 @@ def write_lookup_table(table: LineOfSightTable, path: Path, has_alignment: bool 
     """
     import numpy as np
 
-    from starcal_ground.written_files import write_atomically
+    from starcal_ground.written_files import write_marked
 
     columns: dict[str, Any] = table.columns()  # the stub of savez_compressed wants no others
     if not has_alignment:
@@ -72,10 +72,10 @@ def write_lookup_table(table: LineOfSightTable, path: Path, has_alignment: bool 
             ','.join(repr(float(value)) for value in row)
             for row in zip(*columns.values(), strict=True)
         )
-        write_atomically(path, '\n'.join([','.join(columns), *rows]) + '\n')
+        write_marked(path, '\n'.join([','.join(columns), *rows]) + '\n')
     elif path.suffix == '.npz':
         memory = io.BytesIO()
         np.savez_compressed(memory, **columns)
-        write_atomically(path, memory.getvalue())
+        write_marked(path, memory.getvalue())
     else:
         raise ProductError(f'{path}: ends neither in .csv nor in .npz')

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     from starcal_ground.campaign import calibrate, chosen, observe
     from starcal_ground.images.first_setup import source_of
     from starcal_ground.planning.plan import Cone, plan_pointings, PlanRequest
-    from starcal_ground.written_files import write_atomically
+    from starcal_ground.written_files import write_marked
 
     given = arguments.given(args)
     _, stated = given.checked
@@ -84,7 +84,7 @@ def run(args: argparse.Namespace) -> int:
     arguments.print_notes(campaign.notes)
     plan = plan_pointings(campaign.ensemble, campaign.setup, request)
     if args.output:
-        write_atomically(args.output, _csv(plan))
+        write_marked(args.output, _csv(plan))
     if args.json:
         arguments.print_json(plan)
         return arguments.EXIT_ACCEPTED

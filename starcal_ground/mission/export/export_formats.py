@@ -170,7 +170,7 @@ def export(calibration: Calibration, kind: str, folder: Path, asked: Request) ->
     as `check_outputs` does.
     """
     from starcal_ground.products import check_outputs
-    from starcal_ground.written_files import write_atomically
+    from starcal_ground.written_files import write_marked
 
     row = format_named(kind)
     if asked.table and not row.has_table:
@@ -185,5 +185,5 @@ def export(calibration: Calibration, kind: str, folder: Path, asked: Request) ->
     made = row.make(calibration, asked)
     check_outputs((folder / name for name in made.files), asked.kernels)
     for name, content in made.files.items():
-        write_atomically(folder / name, content)
+        write_marked(folder / name, content)
     return made

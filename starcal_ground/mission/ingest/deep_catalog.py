@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from starcal_ground.mission.ingest.mission_records import Guard
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, IngestError, needing
@@ -145,7 +145,7 @@ def write_deep_catalog(table: Path, output: Path) -> DeepCatalog:
     Raises as `deep_catalog`.
     """
     made = deep_catalog(table)
-    write_atomically(output, catalog_file(made.columns))
+    write_marked(output, catalog_file(made.columns))
     return made
 
 

@@ -170,9 +170,9 @@ def write_bag(
         trackers |= {f'/{frame}/attitude': other for frame, other in others.items()}
         _write_messages(writer, files, options, scale, guard, trackers, velocities, on_image)
         # Just before the bag replaces an older one; the record first, which marks it as ours.
-        written_files.write_atomically(record, json.dumps(content, indent=1) + '\n')
+        written_files.write_marked(record, json.dumps(content, indent=1) + '\n')
         for path, text in prior_files.items():
-            written_files.write_atomically(path, text)
+            written_files.write_marked(path, text)
     return Recorded(bag, params if prior else None, tuple(dict.fromkeys(notes)))
 
 

@@ -14,7 +14,7 @@ from starcal_ground.mission.trend import series as trends
 from starcal_ground.mission.trend.series import Change, Series, Term
 from starcal_ground.mission.trend.trend_table import Row
 from starcal_ground.report import page, svg
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.requirements import requirement_answers
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
@@ -125,7 +125,7 @@ def write_page(
         max_p_value=f'{max_p_value:.2g}',
     )
     path = folder / TREND_FILE
-    write_atomically(path, text)
+    write_marked(path, text)
     return Page(path, count, tuple(failures), tuple(verdicts))
 
 

@@ -22,7 +22,7 @@ import pytest
 
 from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 
 pytestmark = pytest.mark.slow
 
@@ -87,11 +87,11 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         f'plan HERE/bag {_OWN} HERE/bag/tiny_0.mcap',
     ),
     'pointings over the allowed ones': (
-        lambda here: write_atomically(here / 'allowed.csv', 'ra_deg,dec_deg\n1,2\n'),
+        lambda here: write_marked(here / 'allowed.csv', 'ra_deg,dec_deg\n1,2\n'),
         f'plan HERE/bag --pointings HERE/allowed.csv {_OWN} HERE/allowed.csv',
     ),
     'catalog over its table': (
-        lambda here: write_atomically(here / 'gaia.npz', 'a table'),
+        lambda here: write_marked(here / 'gaia.npz', 'a table'),
         'catalog HERE/gaia.npz -o HERE/gaia.npz',
     ),
     'simulation over parameters': (
@@ -178,7 +178,7 @@ def _foreign(path: Path) -> None:
 
 
 def _edited(path: Path) -> None:
-    write_atomically(path, 'of an earlier run\n')
+    write_marked(path, 'of an earlier run\n')
     with path.open('a') as file:
         file.write('and of the user\n')
 
@@ -231,7 +231,7 @@ def test_what_starcal_did_not_write_is_not_replaced(command, campaign, tmp_path,
     if command in WITH_NODES:
         return
     for name in names:
-        write_atomically(here / 'o' / name, 'of an earlier run')
+        write_marked(here / 'o' / name, 'of an earlier run')
     assert main.main(line) == 0, capsys.readouterr()
     old = hashlib.sha256(b'of an earlier run').hexdigest()
     assert old not in digests(here).values()

@@ -32,7 +32,7 @@ from starcal_ground.cli.arguments import EXIT_INTERRUPTED
 from starcal_ground.mission.trend.trend_table import Table
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
-from starcal_ground.written_files import is_marked, write_atomically
+from starcal_ground.written_files import is_marked, write_marked
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.products.product_files import read_calibration
 
@@ -161,7 +161,7 @@ def _old_outputs(command: str, folder: Path) -> Path:
     old.mkdir()
     if command == 'report out':
         shutil.copytree(folder / 'in/a', old, dirs_exist_ok=True)
-        write_atomically(old / 'report.html', 'an older page')
+        write_marked(old / 'report.html', 'an older page')
     elif command.startswith('simulate'):
         made = dataclasses.replace(scenario('tiny', seed=4), image_count=3)
         simulated_bag.write_bag(made, old / 'sim')
@@ -169,7 +169,7 @@ def _old_outputs(command: str, folder: Path) -> Path:
         shutil.copytree(folder / 'in/a/thumbnails', old / 'thumbnails')
         names = [p.name for p in (folder / 'in/a').iterdir() if p.is_file()]
         for name in (*names, 'table.csv'):
-            write_atomically(old / name, f'an older {name}')
+            write_marked(old / name, f'an older {name}')
     return old
 
 

@@ -24,7 +24,7 @@ from starcal_ground.products import (
     OBSERVATIONS_TOPIC,
     write_observations,
 )
-from starcal_ground.written_files import write_atomically
+from starcal_ground.written_files import write_marked
 from starcal_ros.camera.projection import convert
 from starcal_ros.records import FOUND, refused_image, SigmaPart
 
@@ -104,7 +104,7 @@ def test_a_drawing_that_fails_costs_the_drawing_only(
 ) -> None:
     out = tmp_path / 'out'
     out.mkdir()
-    write_atomically(out / 'report.html', 'of earlier products')
+    write_marked(out / 'report.html', 'of earlier products')
     monkeypatch.setattr(place, broken)
     said = starcal('calibrate', few_images, '--params', few_images / 'params.yaml', '-o', out)
     assert said.status == 0 and 'accepted by the gate' in said.out
