@@ -15,7 +15,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export.c_camera import TABLE_FILE
-from starcal_ground.mission.export.export_formats import export, Request
+from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.request import Request
 from starcal_ros.camera import line_of_sight
 from starcal_ros.records import Calibration
 

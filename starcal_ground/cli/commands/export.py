@@ -31,7 +31,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from starcal_ground.cli import arguments, terminal
-from starcal_ground.mission.export.export_formats import export, format_named, FORMATS, Request
+from starcal_ground.mission.export.export_formats import export, format_named, FORMATS
+from starcal_ground.mission.export.request import Request, SpiceNames
 from starcal_ros.errors import OptionError
 from starcal_ros.text import significant
 
@@ -73,7 +74,6 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import products
     from starcal_ground.bags.reader import image_files, read_observations
-    from starcal_ground.mission.export.spice import SpiceNames
     from starcal_ros.formats.products.product_files import calibration_file, read_calibration
 
     file = calibration_file(args.calibration)
@@ -81,7 +81,6 @@ def run(args: argparse.Namespace) -> int:
     names = None
     if args.spacecraft_id is not None:
         names = arguments.record_of(SpiceNames, args)
-    products.make_folder(args.output)
     recorded = file.with_name(products.OBSERVATIONS_FILE)
     observations: tuple[StarObservations, ...] = ()
     names_of_images: dict[int, str] = {}

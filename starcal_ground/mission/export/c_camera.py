@@ -15,12 +15,12 @@ from importlib import resources
 import re
 import struct
 import sys
-from typing import TYPE_CHECKING
 import zlib
 
 import numpy as np
 
 from starcal_ground.mission.export.exported import ascii_line, Content, origin
+from starcal_ground.mission.export.request import Request
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import common_rotation, Derivatives
 from starcal_ros.camera import pixel_grid
@@ -29,9 +29,6 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import calibration_text
 from starcal_ros.records import Calibration, ResidualField
-
-if TYPE_CHECKING:
-    from starcal_ground.mission.export.export_formats import Request
 
 TABLE_FILE = 'starcal_camera.bin'
 _MAGIC = b'STARCALT'

@@ -18,21 +18,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from starcal_ground.mission.export import exported
-from starcal_ground.mission.export.spice import checked_names, kernel_text, SpiceNames, UM_PER_MM
+from starcal_ground.mission.export.request import Request, SpiceNames
+from starcal_ground.mission.export.spice import checked_names, kernel_text, UM_PER_MM
 from starcal_ground.products import CAMERA_INFO_FILE, camera_info_text, yaml_text
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, pixel_grid, project
 from starcal_ros.camera.lens import LENSES, ros_distortion
 from starcal_ros.records import Calibration
-
-if TYPE_CHECKING:
-    from starcal_ground.mission.export.export_formats import Request
 
 _LARGEST = 'thin_prism'  # largest model that both GIANT and mrcal have
 _GIANT_NAMES = {'fx': 'fx', 'fy': 'fy', 'skew': 'alpha', 'cx': 'px', 'cy': 'py'}

@@ -8,38 +8,18 @@ Help, checks, the interface document and the tests read the rows.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from starcal_ground.mission.export.request import Request
 from starcal_ros.errors import OptionError
 
 if TYPE_CHECKING:
     from starcal_ground.mission.export.exported import Content
-    from starcal_ground.mission.export.spice import SpiceNames
-    from starcal_ros.records import Calibration, StarObservations
-
-
-@dataclass(frozen=True)
-class Request:
-    """
-    Inputs of a format besides the calibration.
-
-    ``names`` are None where the NAIF ID of the spacecraft is not given; ``table``: only the
-    numbers of the calibration, for code that was compiled before; ``observations`` and ``kernels``
-    (LSK and SCLK of the spacecraft) are those of the images, ``image_files`` the names of their
-    files by stamp, where they are known; ``catalog`` is the file that identified their stars, None
-    for that of the calibration.
-    """
-
-    names: SpiceNames | None = None
-    table: bool = False
-    observations: Sequence[StarObservations] = ()
-    kernels: Sequence[Path] = ()
-    catalog: Path | None = None
-    image_files: Mapping[int, str] = field(default_factory=dict)
+    from starcal_ros.records import Calibration
 
 
 @dataclass(frozen=True)
@@ -163,13 +143,13 @@ def format_named(name: str) -> Format:
 
 def export(calibration: Calibration, kind: str, folder: Path, asked: Request) -> Content:
     """
-    Write a calibration to a folder in one of `FORMATS`; return what was written.
+    Write a calibration to a folder, made if absent, in one of `FORMATS`; return what was written.
 
     Raises OptionError for an unknown format, for something that it needs and that is missing,
     and for names that SPICE does not allow. Raises ProductError when a file cannot be written, and
     as `check_outputs` does.
     """
-    from starcal_ground.products import check_outputs
+    from starcal_ground.products import check_outputs, make_folder
     from starcal_ground.written_files import write_marked
 
     row = format_named(kind)
@@ -184,6 +164,7 @@ def export(calibration: Calibration, kind: str, folder: Path, asked: Request) ->
         )
     made = row.make(calibration, asked)
     check_outputs((folder / name for name in made.files), asked.kernels)
+    make_folder(folder)
     for name, content in made.files.items():
         write_marked(folder / name, content)
     return made

@@ -14,18 +14,18 @@ the specification of GETFOV.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 import re
 import tempfile
 import textwrap
-from typing import Any, TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export import exported
 from starcal_ground.mission.export.image_attitude import attitude_by_stars
+from starcal_ground.mission.export.request import Request, SpiceNames
 from starcal_ground.mission.ingest.kernels import ephemeris_time, loaded, short
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight
@@ -34,9 +34,6 @@ from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.records import Calibration
-
-if TYPE_CHECKING:
-    from starcal_ground.mission.export.export_formats import Request
 
 _LONGEST_NAME = 32  # pool variables and frames: SPICE Required Reading, kernel.req, frames.req
 _COMMENT_COLUMNS = 78  # longer lines are read, but NAIF asks for no more than 80
@@ -48,33 +45,9 @@ _GEOMETRIC = (
 )
 
 Value = int | str | Sequence[float] | Sequence[str]
-_INSTRUMENTS_PER_SPACECRAFT = 1000  # NAIF: instrument ID = 1000 * spacecraft ID - number
 _SIDE_POINTS = 4  # vertices of the field of view on each side of the detector
 _WIDEST_RAD = np.radians(89.0)  # SPICE sees no polygon wider than a half space
 UM_PER_MM = 1000.0
-
-
-@dataclass(frozen=True)
-class SpiceNames:
-    """
-    NAIF identifiers and frame names of a mission.
-
-    ``instrument_id`` 0: ``1000 * spacecraft_id - 1``.  ``star_tracker_id`` 0: another frame kernel
-    defines the star tracker frame; else the FK defines it as a CK frame of this number.  Empty
-    frame names: those of the calibration.  ``pixel_size_um`` 0: not known.
-    """
-
-    spacecraft_id: int
-    instrument_id: int = 0
-    star_tracker_id: int = 0
-    camera_frame: str = ''
-    star_tracker_frame: str = ''
-    pixel_size_um: float = 0.0
-
-    @property
-    def camera_id(self) -> int:
-        """Identifier of the instrument and of its frame."""
-        return self.instrument_id or _INSTRUMENTS_PER_SPACECRAFT * self.spacecraft_id - 1
 
 
 def spice_kernels(calibration: Calibration, asked: Request) -> exported.Content:

@@ -15,7 +15,6 @@ import io
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +28,7 @@ from starcal_ground.mission.export.image_attitude import (
     camera_of_image,
     without_outliers,
 )
+from starcal_ground.mission.export.request import Request
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import detector_sight, line_of_sight_sigma_arcsec
 from starcal_ros.camera import line_of_sight, pixel_grid
@@ -37,9 +37,6 @@ from starcal_ros.errors import needing, ProductError
 from starcal_ros.records import Calibration, ORIGINAL, StarObservations, TIMES
 from starcal_ros.sky.astrometry import julian_year
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
-
-if TYPE_CHECKING:
-    from starcal_ground.mission.export.export_formats import Request
 
 _MOST_SIP_ORDER = 9  # keywords have one digit for it
 _GOOD_PX = 5e-3  # half of the centroid noise of a bright star

@@ -19,7 +19,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
-from starcal_ground.mission.export.export_formats import export, Request
+from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.request import Request
 from starcal_ground.written_files import write_calibration
 from starcal_ros.assessment.lookup import (
     common_rotation,

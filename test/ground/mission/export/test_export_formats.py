@@ -23,9 +23,9 @@ import yaml
 from starcal_ground.cli.commands import export as export_command
 from starcal_ground.cli.main import main
 from starcal_ground.mission.export import export_formats
-from starcal_ground.mission.export.export_formats import export, Format, FORMATS, Request
+from starcal_ground.mission.export.export_formats import export, Format, FORMATS
 from starcal_ground.mission.export.exported import Content
-from starcal_ground.mission.export.spice import SpiceNames
+from starcal_ground.mission.export.request import Request, SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.camera_yaml import read_camera_info

@@ -13,9 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 import spiceypy
 
-from starcal_ground.mission.export.export_formats import export, Request
+from starcal_ground.mission.export.export_formats import export
 from starcal_ground.mission.export.exported import Content
-from starcal_ground.mission.export.spice import SpiceNames
+from starcal_ground.mission.export.request import Request, SpiceNames
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.errors import OptionError, ProductError
@@ -168,7 +168,8 @@ def test_the_kernel_of_the_mission_may_define_the_star_tracker(load, tmp_path) -
 )
 def test_names_that_spice_does_not_take_are_refused(names, words, tmp_path) -> None:
     with pytest.raises(OptionError, match=words):
-        export(calibration(), 'spice', tmp_path, Request(names))
+        export(calibration(), 'spice', tmp_path / 'new', Request(names))
+    assert not (tmp_path / 'new').exists()
 
 
 def test_a_field_of_view_wider_than_a_half_space_is_left_out(tmp_path) -> None:

@@ -16,7 +16,8 @@ import pytest
 
 from starcal_ground import directions_icrf
 from starcal_ground.bags.reader import read_observations
-from starcal_ground.mission.export.export_formats import export, Request
+from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.request import Request
 from starcal_ground.products import OBSERVATIONS_FILE, OBSERVATIONS_TOPIC
 from starcal_ground.simulation.scenario import scenario, scene
 from starcal_ground.undistortion import straight_camera
