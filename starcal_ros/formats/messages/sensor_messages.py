@@ -135,28 +135,36 @@ def jpeg_header(content: bytes) -> Header | None:
     return None
 
 
-def _has_surplus(content: bytes, header: Header) -> bool:
+def _check_png(content: bytes, header: Header) -> None:
     """
-    True if a PNG inflates to far more than its pixels, which a decoder would throw away.
+    Raise ValueError for a PNG that is not whole, or that inflates to far more than its pixels.
 
-    A megabyte of compressed data can hold a gigabyte: seconds for nothing.
+    A megabyte of compressed data can hold a gigabyte: seconds for nothing.  On a damaged chunk
+    libpng would print a line of its own; those that a decoder may skip have a small first letter.
     """
     most = 2 * (2 * header.width * header.channels + 8) * header.height  # 16 bit, interlaced
-    inflate, at, size = zlib.decompressobj(), 8, 0
+    inflate, at, size, view = zlib.decompressobj(), 8, 0, memoryview(content)
     for _ in range(_PNG_MOST_CHUNKS):
         if at + _PNG_CHUNK.size > len(content):
-            return False
+            raise ValueError('is cut off')
         length, name = _PNG_CHUNK.unpack_from(content, at)
-        at += _PNG_CHUNK.size
+        end = at + _PNG_CHUNK.size + length
+        if end + 4 > len(content):
+            raise ValueError('is cut off')
+        needed = name[:1].isupper()
+        if needed and zlib.crc32(view[at + 4 : end]) != int.from_bytes(view[end : end + 4], 'big'):
+            raise ValueError('is damaged')
+        if name == b'IEND':
+            return
         if name == b'IDAT':
             try:
-                size += len(inflate.decompress(content[at : at + length], most - size + 1))
-            except zlib.error:
-                return False  # the decoder refuses it
+                size += len(inflate.decompress(view[end - length : end], most - size + 1))
+            except zlib.error as error:
+                raise ValueError('is damaged') from error
             if size > most:
-                return True
-        at += length + 4  # its checksum
-    return True
+                raise ValueError('inflates to far more than its pixels')
+        at = end + 4
+    raise ValueError('has too many parts')
 
 
 def decoded(content: bytes, header: Header | None) -> AnyArray:
@@ -170,8 +178,8 @@ def decoded(content: bytes, header: Header | None) -> AnyArray:
         sides = header[:2]
         if min(sides) < 1 or max(sides) > MAX_SIDE_PX or math.prod(sides) > MOST_PIXELS:
             raise ValueError(f'its header claims {sides[0]} x {sides[1]} pixels')
-        if png_header(content) and _has_surplus(content, header):
-            raise ValueError('inflates to far more than its pixels')
+        if png_header(content):
+            _check_png(content, header)
     values = None
     with contextlib.suppress(cv2.error):
         values = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)

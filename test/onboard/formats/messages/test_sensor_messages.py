@@ -56,6 +56,7 @@ from starcal_ros.records import Image, StarObservations
 
 LETTER = {'red': 'r', 'green': 'g', 'blue': 'b'}
 RAMP = np.arange(12, dtype=np.uint16).reshape(3, 4) * 257 + 3
+ENCODED: bytes = cv2.imencode('.png', RAMP)[1].tobytes()
 
 
 def raw(encoding: str, width: int, height: int, step: int, big: bool, data: Any) -> Any:
@@ -212,7 +213,7 @@ def test_a_stamp_that_no_message_can_hold_is_refused(sec: int, offset_s: float) 
         (b'\xff\xd8\xff\xe0\0', 'bad_encoding'),
         (cv2.imencode('.jpg', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
         (cv2.imencode('.png', np.zeros((2, 2, 3), np.uint8))[1].tobytes(), 'bad_encoding'),
-        (cv2.imencode('.png', RAMP)[1].tobytes()[:20], 'bad_encoding'),
+        (ENCODED[:20], 'bad_encoding'),
     ],
 )
 def test_compressed_refusals(data: bytes, reason: str) -> None:
@@ -227,17 +228,20 @@ def test_compressed_refusals(data: bytes, reason: str) -> None:
         (png(60000, 60000), 'its header claims 60000 x 60000 pixels'),
         (png(70000, 2), 'its header claims 70000 x 2 pixels'),
         (png(4, 3, bytes(10**7)), 'inflates to far more than its pixels'),
-        (cv2.imencode('.png', RAMP)[1].tobytes()[:40], 'damaged, or in a format'),
+        (ENCODED[:40], 'is cut off'),
+        (ENCODED[:-12], 'is cut off'),
+        (ENCODED.replace(b'IDAT\x08', b'IDAT\x09'), 'is damaged'),
     ],
 )
 def test_files_and_messages_refuse_the_same_pictures(
-    tmp_path: Path, content: bytes, words: str
+    tmp_path: Path, content: bytes, words: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(ImageRefused, match=f'bad_layout: PNG: {words}'):
         decode_compressed(content, TIME_NS)
     (tmp_path / 'a.png').write_bytes(content)
     with pytest.raises(IngestError, match=rf'a\.png: {words}'):
         read_image(tmp_path / 'a.png')
+    assert capfd.readouterr() == ('', '')  # libpng would print lines of its own
 
 
 @pytest.mark.parametrize('ending', ['.png', '.jpg'])
