@@ -34,15 +34,14 @@ from starcal_ros.estimation.amplitudes import (
 from starcal_ros.estimation.equations import (
     arrow,
     chain_columns,
-    eliminated,
-    Equations,
     Linearisation,
     seen_by_stars,
     StarSums,
     tracker_turns,
     weighted_rows_by,
+    without_images,
 )
-from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.levenberg_marquardt import Equations, inverse, NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE, STEP_SIGMA
 from starcal_ros.estimation.problem import whitened_attitude_errors
 from starcal_ros.estimation.shared_errors import group_sums, SharedError
@@ -154,7 +153,7 @@ def posterior(
     layout = linear.layout
     before = np.broadcast_to(before, len(layout.shape))
     normal = arrow(sums, linear.problem, linear.state, layout)
-    start = eliminated(normal, layout, before)
+    start = without_images(normal, layout, before)
     solver = _Solver(layout)
     base, field_px = solver.likely(start, near.field if near else None)
     none = Amplitudes(np.full(len(before), math.log(LEAST_PX)), 0.0)
@@ -162,7 +161,7 @@ def posterior(
     if len(sums.blocks) > 1:
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shapes.amplitudes if near else None)
-        last = eliminated(normal, layout, found.sigma_px)
+        last = without_images(normal, layout, found.sigma_px)
     mean, covariance, last_octave, term, log_evidence = solver.solve(last, base)
     # The unknowns of the images, eliminated, and the prior of their amplitudes.
     log_evidence += 0.5 * float(np.linalg.slogdet(last.covariance)[1].sum())
