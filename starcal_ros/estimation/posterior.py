@@ -186,17 +186,16 @@ def posterior(
 
 
 def without_prior(
-    sums: StarSums, linear: Linearisation, name: str, near: Posterior, held: int | None = None
+    sums: StarSums, linear: Linearisation, freed: Unknown, near: Posterior
 ) -> tuple[Floats, Floats, float]:
     """
     Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
 
-    With ``held`` only that number of the entry, which is held, is free.
-
-    The amplitudes are estimated again: field and shapes may hide that a prior is wrong.  A free
-    trend and a free velocity would absorb errors of the lens, so the trend keeps its value of the
-    posterior ``near`` with the prior, and its cost.  The variance is that of the working weights;
-    infinite where stars show less than what is possible at all.
+    ``freed`` is the entry with the sigmas that are to hold in place of its prior.  The amplitudes
+    are estimated again: field and shapes may hide that a prior is wrong.  A free trend and a free
+    velocity would absorb errors of the lens, so the trend keeps its value of the posterior
+    ``near`` with the prior, and its cost.  The variance is that of the working weights; infinite
+    where stars show less than what is possible at all.
     """
     at_trend = linear.layout.trend_at
     trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
@@ -205,15 +204,15 @@ def without_prior(
     )
     entries = []
     for entry in linear.layout.entries:
-        if entry.name == name:
-            entry = dataclasses.replace(entry, sigma=_without_prior(entry, held))
+        if entry.name == freed.name:
+            entry = freed
         elif entry.kind.cause == CHANGE and not entry.of_image:
             kept = near.mean[linear.layout.places[entry.name]]
             entry = dataclasses.replace(entry, sigma=entry.sigma / FREE_FACTOR, offset=-kept)
         entries.append(entry)
     wide = Layout(tuple(entries))
     linear = dataclasses.replace(linear, layout=wide)
-    at = wide.of([name])
+    at = wide.of([freed.name])
     try:
         found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
@@ -226,14 +225,6 @@ def without_prior(
         # The wide prior pulls a little: off + mean is the sum of both by their information.
         alone = (off + found.mean[at]) * (1.0 + precision * variance) - off
     return np.where(seen, alone, 0.0), variance, found.log_evidence - cost
-
-
-def _without_prior(entry: Unknown, held: int | None) -> Floats:
-    """Return the sigma (q,) of an entry without its prior: the largest possible."""
-    if held is not None:
-        return np.where(np.arange(len(entry)) == held, np.inf, entry.sigma)
-    widest = np.minimum(FREE_FACTOR * entry.sigma, entry.widest)
-    return np.asarray(np.maximum(entry.sigma, widest))
 
 
 class _Solver:
