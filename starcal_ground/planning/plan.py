@@ -46,7 +46,7 @@ from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import IMAGE_ROTATION, like, unknowns_of
+from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
@@ -238,11 +238,18 @@ def _rows(
     """
     problem, state = _as_estimated(estimate, candidates, options)
     camera, known, count = estimate.geometry.camera, estimate.linear.layout, len(candidates)
-    rates = Rates(np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)))  # a camera at rest
-    zenith = np.array([image.zenith_icrf for image in candidates])
-    size_arcsec = float(candidates[0].refraction_arcsec[0])
-    air = Refraction(np.zeros(count, np.int64), zenith, size_arcsec, 1.0)
-    rates, assumed = like(known, rates, air)
+    # The camera is at rest.  The sigmas are of no account: the estimate has the priors already.
+    readout, stamps = (float(len(known.of([name])) > 1) for name in ('readout', 'stamps'))
+    has_rates = not (readout or stamps)  # three turns stand for them where no image has a rate
+    rates = Rates(
+        np.full((count, 3), 0.0 if has_rates else np.nan), np.tile(np.eye(3), (count, 1, 1))
+    )
+    air = None
+    if len(known.of(['site'])) == 2:  # latitude and one clock
+        zenith = np.array([image.zenith_icrf for image in candidates])
+        size_arcsec = float(candidates[0].refraction_arcsec[0])
+        air = Refraction(np.zeros(count, np.int64), zenith, size_arcsec, 1.0)
+    assumed = Assumptions(float('velocity' in known), (0.0, readout), stamps, air)
     layout = unknowns_of(problem, state, rates, (camera.width, camera.height), assumed)
     place = [known.labels.index(label) for label in layout.labels]
     table = star_table(candidates)

@@ -436,19 +436,6 @@ def unknowns_of(
     return Layout(tuple(entry for entry in entries if entry is not None and len(entry)))
 
 
-def like(layout: Layout, rates: Rates, air: Refraction | None) -> tuple[Rates, Assumptions]:
-    """
-    Return rates and assumptions that give images at rest the columns of a list.
-
-    The sigmas are of no account: the information of the priors is in the list already.
-    """
-    readout, stamps = (float(len(layout.of([name])) > 1) for name in ('readout', 'stamps'))
-    if readout or stamps:  # three turns, since no image has a rate
-        rates = dataclasses.replace(rates, rad_s=np.full_like(rates.rad_s, np.nan))
-    air = air if len(layout.of(['site'])) == 2 else None  # latitude and one clock
-    return rates, Assumptions(float('velocity' in layout), (0.0, readout), stamps, air)
-
-
 def readout_rms_s(layout: Layout, mean: Floats, covariance: Floats, assumed: Assumptions) -> float:
     """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
     if not {'rates', 'readout'} <= set(layout.places):
