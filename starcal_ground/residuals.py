@@ -100,7 +100,7 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
         colour_bp_rp=colour_bp_rp,
         measured_px=table.measured_px,
         residual_px=estimate.residual_px,
-        covariance_px2=estimate.covariance_px2,
+        covariance_px2=estimate.weights.covariance_px2,
         used=estimate.kept,
     )
 

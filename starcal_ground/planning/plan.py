@@ -119,7 +119,7 @@ def expected_noise_px2(estimate: Estimate, magnitude: Floats) -> Floats:
     """
     table = estimate.table
     order = np.argsort(table.magnitude)
-    information = 1.0 / estimate.covariance_px2[order][:, [0, 2]].mean(axis=1)
+    information = 1.0 / estimate.weights.variance_px2[order]
     share = np.cumsum(information) / information.sum()
     group = np.minimum((share * _GROUPS).astype(np.int64), _GROUPS - 1)
     count = np.bincount(group, minlength=_GROUPS)

@@ -178,7 +178,7 @@ def detector_step(estimate: Estimate) -> DetectorStep:
     camera = estimate.geometry.camera
     strip_px = coarsest_cell_px(camera.width)
     residual_px = estimate.residual_px[kept]
-    weight = 2.0 / (estimate.covariance_px2[kept, 0] + estimate.covariance_px2[kept, 2])
+    weight = 1.0 / estimate.weights.variance_px2[kept]
     best, best_significance, trials = ('u', 0.0, 'u', 0.0), 0.0, 0
     for axis, size in enumerate((camera.width, camera.height)):
         inner_px = (1.0 - 2.0 * _MARGIN) * size

@@ -175,8 +175,7 @@ def _groups(estimate: Estimate, expected: Floats, used: Mask) -> list[ResidualBi
     """Bins of stars, cells and stars of like brightness: sums over their predicted sigma."""
     rows = np.flatnonzero(used)
     residual_px = estimate.residual_px[rows]
-    covariance = estimate.covariance_px2[rows]
-    variance = 0.5 * (covariance[:, 0] + covariance[:, 2])
+    variance = estimate.weights.variance_px2[rows]
     free = 0.5 * np.minimum(expected[rows], 2.0)
     from_sky = estimate.weights.from_sky[rows]
     on_sky = np.einsum('nba,nb->na', from_sky, residual_px)

@@ -9,7 +9,7 @@ give the same precision, and enter the covariance exactly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.sparse import csr_array
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     Amplitudes,
     averaged_field,
@@ -31,6 +31,7 @@ from starcal_ros.estimation.amplitudes import (
     ShapeSums,
     STARTS_PX,
 )
+from starcal_ros.estimation.centroid_variance import CentroidVariance
 from starcal_ros.estimation.equations import (
     arrow,
     chain_columns,
@@ -44,8 +45,9 @@ from starcal_ros.estimation.equations import (
 from starcal_ros.estimation.levenberg_marquardt import Equations, inverse, NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE, STEP_SIGMA
 from starcal_ros.estimation.problem import whitened_attitude_errors
-from starcal_ros.estimation.shared_errors import group_sums, SharedError
-from starcal_ros.estimation.tracker_errors import TrackerErrors
+from starcal_ros.estimation.shared_errors import group_sums, SharedError, star_shares_px2
+from starcal_ros.estimation.star_equations import StarTable
+from starcal_ros.estimation.tracker_errors import AttitudeErrors, TrackerErrors
 from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
 
 
@@ -353,26 +355,59 @@ TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
 
 
 @dataclass(frozen=True)
-class Weights:
+class Weighting:
     """
-    Covariances of the observations as they are weighted, and the errors that they share.
+    Conclusions from the residuals of a round: the weights of the next one.
 
     Attributes
     ----------
-    variance_px2 : (n,)
-        Variance of each observation per axis.
-    inflation_px2 : (n,)
-        Variance per axis that the working weights have beyond that of each observation.
+    table : StarTable
+        Its n observations are weighted.
     from_sky : (n, 2, 2)
+        Rotation of a displacement fixed to the star into pixel axes.
+    variance : CentroidVariance
+        How the centroid covariances are corrected.
     errors : tuple of SharedError
-    trackers : tuple of TrackerErrors
+    kept : (n,) bool
+        Observations that are used.
+    attitudes : AttitudeErrors or None
+        None before the first round.
     """
 
-    variance_px2: Floats
-    inflation_px2: Floats
+    table: StarTable
     from_sky: Floats
+    variance: CentroidVariance
     errors: tuple[SharedError, ...]
-    trackers: tuple[TrackerErrors, ...]
+    kept: Mask
+    attitudes: AttitudeErrors | None
+
+    @functools.cached_property
+    def covariance_px2(self) -> Floats:
+        """Covariances (n, 3) of the observations: noise, and errors that a star alone has."""
+        covariance_px2 = self.variance.of(self.table.covariance_px2, self.table.magnitude)
+        beyond_px2 = np.broadcast_to(star_shares_px2(self.errors)[1], len(self.table))
+        return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
+
+    @functools.cached_property
+    def variance_px2(self) -> Floats:
+        """Variance (n,) of the observations per axis."""
+        return np.asarray(self.covariance_px2[:, [0, 2]].mean(axis=1))
+
+    @functools.cached_property
+    def inflation_px2(self) -> Floats:
+        """
+        Variance (n,) by which the weights are lower for errors that images share.
+
+        With it, k images of a star weigh as the mean of theirs does.
+        """
+        star = self.table.star
+        sightings = np.bincount(star, self.kept, int(star.max()) + 1)[star]
+        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_shares_px2(self.errors)[0])
+
+    @property
+    def working_px2(self) -> Floats:
+        """Covariances (n, 3) whose inverses are the weights."""
+        return self.covariance_px2 + np.outer(self.inflation_px2, [1.0, 0.0, 1.0])
 
 
 def is_settled(found: Posterior, before: Posterior) -> bool:
@@ -396,7 +431,8 @@ def with_shared_errors(
     found: Posterior,
     sums: StarSums,
     linear: Linearisation,
-    weights: Weights,
+    weights: Weighting,
+    trackers: Sequence[TrackerErrors],
     negligible: float = NEGLIGIBLE,
 ) -> Posterior:
     """
@@ -408,7 +444,7 @@ def with_shared_errors(
     layout = linear.layout
     root, held = _root(found.working, found.estimated, sums, layout, negligible)
     excess, shared = _of_observations(found, linear, weights, root)
-    of_attitudes, by_tracker = _of_attitudes(found, linear, weights, root)
+    of_attitudes, by_tracker = _of_attitudes(found, linear, trackers, root)
     excess += of_attitudes
     none = (0, held.shape[1])  # errors of the modes that priors hold
     return dataclasses.replace(
@@ -450,7 +486,7 @@ def _root(
 
 
 def _of_observations(
-    found: Posterior, linear: Linearisation, weights: Weights, root: Floats
+    found: Posterior, linear: Linearisation, weights: Weighting, root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """
     Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, and the errors that they share.
@@ -470,7 +506,7 @@ def _of_observations(
 
 
 def _of_attitudes(
-    found: Posterior, linear: Linearisation, weights: Weights, root: Floats
+    found: Posterior, linear: Linearisation, trackers: Sequence[TrackerErrors], root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """Return the same (r, r) of the star-tracker attitudes, by noise and slow errors."""
     _, J = whitened_attitude_errors(linear.problem, linear.state)
@@ -479,7 +515,7 @@ def _of_attitudes(
     r = root.shape[1]
     working, noise, slow = np.zeros((3, r, r))
     sigma_rad = linear.problem.star_tracker_sigma_rad
-    for tracker in weights.trackers:
+    for tracker in trackers:
         group, images = tracker.group, tracker.images
         to_working2 = (tracker.sigma_rad / sigma_rad[images[0], tracker.axes[0]]) ** 2
         shared = tracker.covariance - tracker.independent * np.eye(len(tracker.covariance))

@@ -202,8 +202,8 @@ def _not_judged(
         star_tracker_sigma_arcsec=tuple(
             float(sigma) for sigma in result.star_tracker_sigma_rad / ARCSECOND_RAD
         ),
-        centroid_scale=result.variance.scale,
-        centroid_floor_px=math.sqrt(result.variance.floor_px2),
+        centroid_scale=result.weights.variance.scale,
+        centroid_floor_px=math.sqrt(result.weights.variance.floor_px2),
         dropped_catalog_ids=tuple(result.dropped_catalog_id.tolist()),
         misfit_images_ns=tuple(np.array(stamps_ns)[result.misfit_image].tolist()),
         singular_values=tuple(float(value) for value in singular_values),
