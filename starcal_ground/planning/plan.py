@@ -46,7 +46,7 @@ from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import Assumptions, IMAGE_ROTATION, unknowns_of
+from starcal_ros.estimation.unknowns import Assumptions, EntryInputs, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
@@ -250,7 +250,8 @@ def _rows(
         size_arcsec = float(candidates[0].refraction_arcsec[0])
         air = Refraction(np.zeros(count, np.int64), zenith, size_arcsec, 1.0)
     assumed = Assumptions(float('velocity' in known), (0.0, readout), stamps, air)
-    layout = unknowns_of(problem, state, rates, (camera.width, camera.height), assumed)
+    size = camera.width, camera.height
+    layout = unknowns_of(EntryInputs(problem, state, rates, size, assumed))
     place = [known.labels.index(label) for label in layout.labels]
     table = star_table(candidates)
     measurements = arrange(table, np.ones(len(table), bool), table.covariance_px2)
@@ -266,7 +267,9 @@ def _rows(
         of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])
         shared[:, of_tracker[:, None], turning] = -J[chunk.image] @ turns[chunk.image]
         own[:, of_tracker, IMAGE_ROTATION] = J[chunk.image]
-        own[:, of_shape, layout.shape_at] = np.diag(1.0 / estimate.posterior.shapes.sigma_px)
+        own[:, of_shape, layout.places['shape']] = np.diag(
+            1.0 / estimate.posterior.shapes.sigma_px
+        )
         Q = np.linalg.qr(own)[0]
         yield chunk.image, place, shared - Q @ (Q.transpose(0, 2, 1) @ shared)
 

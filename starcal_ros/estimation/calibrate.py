@@ -68,11 +68,11 @@ from starcal_ros.estimation.tracker_errors import (
 )
 from starcal_ros.estimation.unknowns import (
     Assumptions,
+    EntryInputs,
     FIELD_OCTAVES,
     IMAGE_ROTATION,
     Layout,
     moved,
-    readout_rms_s,
     unknowns_of,
 )
 from starcal_ros.estimation.weights import (
@@ -239,20 +239,18 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     from_sky = sky_rotations(state, table, data.prior.camera)
     judged = Weighting(table, from_sky, variance, (), every, None)
     judged = judge(data, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats | float = STARTS_PX[0]
     before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
     before_sigma: Floats = np.empty(0)
     for k in range(MOST_ROUNDS):
-        last = _round(data, problem, state, judged, residual_px, shape_px, before, share)
+        last = _round(data, problem, state, judged, residual_px, before, share)
         iterations += 1
         if before and is_settled(last.posterior, before.posterior):
             termination = 'converged'
             break
         after = judge(data, last.residual_px, last.freedom, judged, last.posterior, last.attitudes)
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shapes.sigma_px, STARTS_PX[0])
         if k < MOST_ROUNDS - 1:
             state, judged = last.after, after
         # Steps of unknowns that stars hardly show oscillate: the ratio of successive steps damps
@@ -285,7 +283,6 @@ def _round(
     state: State,
     judged: Weighting,
     residual_px: Floats,
-    shape_px: Floats | float,
     before: _Round | None,
     share: float,
 ) -> _Round:
@@ -293,16 +290,15 @@ def _round(
     table, camera = data.table, data.prior.camera
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
     size = camera.width, camera.height
-    readout_s = math.hypot(*data.assumed.readout_s)
-    if before:
-        last = before.posterior
-        readout_s = readout_rms_s(last.layout, last.mean, last.working, data.assumed)
+    near = before.posterior if before else None
+    readout_s = _readout_rms_s(data.assumed, near)
     rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
-    layout = unknowns_of(problem, state, rates, size, data.assumed)
+    layout = unknowns_of(EntryInputs(problem, state, rates, size, data.assumed))
     measurements = arrange(table, judged.kept, judged.working_px2)
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
-    found = posterior(sums, linear, shape_px, before.posterior if before else None)
+    shape_px = np.maximum(near.shapes.sigma_px, STARTS_PX[0]) if near else STARTS_PX[0]
+    found = posterior(sums, linear, shape_px, near)
     # Unknowns outside the state, such as a velocity, take their mean; the images follow both.
     shared = found.mean.copy()
     shared[layout.in_state] *= share
@@ -312,6 +308,14 @@ def _round(
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, taken, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
+
+
+def _readout_rms_s(assumed: Assumptions, near: Posterior | None) -> float:
+    """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
+    if near is None or not {'rates', 'readout'} <= set(near.layout.places):
+        return math.hypot(*assumed.readout_s)
+    at = near.layout.places['readout'].start
+    return math.hypot(near.mean[at], near.working[at, at] ** 0.5)
 
 
 def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
