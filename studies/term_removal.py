@@ -79,7 +79,7 @@ def removal_study(estimate: Estimate) -> tuple[TermRemoval, ...]:
     # Unknowns outside of the search (field, shapes, velocity) keep their estimates.
     estimate = _with_search_alone(estimate)
     problem, state = estimate.linear.problem, estimate.linear.state
-    measurements = arrange(estimate.table, estimate.kept, estimate.covariance_px2)
+    measurements = arrange(estimate.table, estimate.kept, estimate.weights.covariance_px2)
     solution = minimise(problem, state, measurements, least_gain=_LEAST_GAIN)
     cost = solution.normal.cost
     names = estimate.geometry.camera.parameter_names

@@ -25,7 +25,7 @@ from starcal_ros.assessment.observability import map_sigma_px
 from starcal_ros.camera import CameraModel, line_of_sight, PARAMETER_NAMES, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
-from starcal_ros.estimation.levenberg_marquardt import inverse, NormalEquations
+from starcal_ros.estimation.levenberg_marquardt import eliminated, inverse, NormalEquations
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
 from starcal_ros.estimation.star_equations import arrange, normal_blocks, star_table
 from starcal_ros.records import CameraGeometry, Ensemble, MapCovariance, StarObservations
@@ -146,8 +146,7 @@ def information_blocks(field: StarField) -> Floats:
 
 def shared_covariance(normal: NormalEquations) -> Floats:
     """Covariance of the shared unknowns, the images eliminated."""
-    hidden = np.einsum('mqi,mqj->ij', normal.B, np.linalg.solve(normal.C, normal.B))
-    return inverse(normal.A - hidden)
+    return inverse(eliminated(normal).information)
 
 
 def bound(method: str, blocks: Floats, tracker_arcsec: float) -> MapCovariance:

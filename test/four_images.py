@@ -25,7 +25,7 @@ from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.problem import Problem, State
 from starcal_ros.estimation.star_equations import arrange, Measurements, StarTable
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import Assumptions, Layout, unknowns_of
+from starcal_ros.estimation.unknowns import Assumptions, EntryInputs, Layout, unknowns_of
 
 WIDTH, HEIGHT = 1200, 800
 IMAGES, STARS = 4, 20
@@ -235,7 +235,7 @@ def small(
         IMAGES,
     )
     assumed = dataclasses.replace(assumed, colour=COLOUR)
-    layout = unknowns_of(problem, state, given_rates, (WIDTH, HEIGHT), assumed)
+    layout = unknowns_of(EntryInputs(problem, state, given_rates, (WIDTH, HEIGHT), assumed))
     keep = np.arange(len(image)) % STARS < np.array([20, 18, 16, 13])[image]
     made = Small(problem, state, table, given_rates, layout, keep)
     if shapes_px is None and not field_px:

@@ -46,7 +46,7 @@ from starcal_ros.estimation.refraction import Refraction
 from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
-from starcal_ros.estimation.unknowns import IMAGE_ROTATION, like, unknowns_of
+from starcal_ros.estimation.unknowns import Assumptions, EntryInputs, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict, within_image
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
@@ -119,7 +119,7 @@ def expected_noise_px2(estimate: Estimate, magnitude: Floats) -> Floats:
     """
     table = estimate.table
     order = np.argsort(table.magnitude)
-    information = 1.0 / estimate.covariance_px2[order][:, [0, 2]].mean(axis=1)
+    information = 1.0 / estimate.weights.variance_px2[order]
     share = np.cumsum(information) / information.sum()
     group = np.minimum((share * _GROUPS).astype(np.int64), _GROUPS - 1)
     count = np.bincount(group, minlength=_GROUPS)
@@ -238,12 +238,20 @@ def _rows(
     """
     problem, state = _as_estimated(estimate, candidates, options)
     camera, known, count = estimate.geometry.camera, estimate.linear.layout, len(candidates)
-    rates = Rates(np.zeros((count, 3)), np.tile(np.eye(3), (count, 1, 1)))  # a camera at rest
-    zenith = np.array([image.zenith_icrf for image in candidates])
-    size_arcsec = float(candidates[0].refraction_arcsec[0])
-    air = Refraction(np.zeros(count, np.int64), zenith, size_arcsec, 1.0)
-    rates, assumed = like(known, rates, air)
-    layout = unknowns_of(problem, state, rates, (camera.width, camera.height), assumed)
+    # The camera is at rest.  The sigmas are of no account: the estimate has the priors already.
+    readout, stamps = (float(len(known.of([name])) > 1) for name in ('readout', 'stamps'))
+    has_rates = not (readout or stamps)  # three turns stand for them where no image has a rate
+    rates = Rates(
+        np.full((count, 3), 0.0 if has_rates else np.nan), np.tile(np.eye(3), (count, 1, 1))
+    )
+    air = None
+    if len(known.of(['site'])) == 2:  # latitude and one clock
+        zenith = np.array([image.zenith_icrf for image in candidates])
+        size_arcsec = float(candidates[0].refraction_arcsec[0])
+        air = Refraction(np.zeros(count, np.int64), zenith, size_arcsec, 1.0)
+    assumed = Assumptions(float('velocity' in known), (0.0, readout), stamps, air)
+    size = camera.width, camera.height
+    layout = unknowns_of(EntryInputs(problem, state, rates, size, assumed))
     place = [known.labels.index(label) for label in layout.labels]
     table = star_table(candidates)
     measurements = arrange(table, np.ones(len(table), bool), table.covariance_px2)
@@ -259,7 +267,9 @@ def _rows(
         of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])
         shared[:, of_tracker[:, None], turning] = -J[chunk.image] @ turns[chunk.image]
         own[:, of_tracker, IMAGE_ROTATION] = J[chunk.image]
-        own[:, of_shape, layout.shape_at] = np.diag(1.0 / estimate.posterior.shapes.sigma_px)
+        own[:, of_shape, layout.places['shape']] = np.diag(
+            1.0 / estimate.posterior.shapes.sigma_px
+        )
         Q = np.linalg.qr(own)[0]
         yield chunk.image, place, shared - Q @ (Q.transpose(0, 2, 1) @ shared)
 

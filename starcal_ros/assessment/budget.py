@@ -274,7 +274,7 @@ def _of_unknowns(
             continue
         entry = layout[names[0]]
         text = entry.kind.assumption(layout, found.mean, options)
-        if entry is layout.field:
+        if cause == 'field':
             text = _estimated(_field_px(estimate), found.field.likelihood_ratio)
         yield _part(cause, _gain(errors, _known(errors, estimate, names), seen), text)
 
@@ -316,7 +316,7 @@ def _field_px(estimate: Estimate) -> float:
 
 
 def _of_stars(estimate: Estimate) -> str:
-    variance = estimate.covariance_px2[estimate.kept][:, [0, 2]].mean()
+    variance = estimate.weights.variance_px2[estimate.kept].mean()
     rms_px = significant(math.sqrt(variance), 2)
     return f'estimated: {rms_px} px rms of {int(estimate.kept.sum())} centroids'
 

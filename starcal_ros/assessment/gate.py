@@ -213,15 +213,19 @@ def _reason(check: GateCheck) -> str:
     )
 
 
+def _fact(name: str, note: str, passed: bool | None) -> GateCheck:
+    """Return a check without a number and a limit; its note is the reason where it failed."""
+    return GateCheck(name, '', math.nan, math.nan, '', passed, note)
+
+
 def _solver(calibration: Calibration) -> GateCheck:
-    passed = calibration.termination == 'converged'
-    note = (
-        f'the solver did not converge ({calibration.termination}); check lens_model and the prior'
-        ' camera, and that all images are of one camera'
-    )
-    return GateCheck(
-        'solver converged', '', math.nan, math.nan, '', passed, '' if passed else note
-    )
+    note = ''
+    if calibration.termination != 'converged':
+        note = (
+            f'the solver did not converge ({calibration.termination}); check lens_model and the'
+            ' prior camera, and that all images are of one camera'
+        )
+    return _fact('solver converged', note, not note)
 
 
 def _numbers(calibration: Calibration) -> GateCheck:
@@ -238,8 +242,7 @@ def _numbers(calibration: Calibration) -> GateCheck:
         note = 'a parameter, its covariance or the residual is not a finite number'
     elif (np.diag(calibration.covariance) < 0).any():
         note = 'a variance is negative'
-    name = 'numbers finite, variances positive'
-    return GateCheck(name, '', math.nan, math.nan, '', not note, note)
+    return _fact('numbers finite, variances positive', note, not note)
 
 
 def _fit(
@@ -334,8 +337,7 @@ def model_gate(found: ModelChecks | None, options: GateOptions) -> Iterator[Gate
     if found is None:
         return
     for one in found.statements:
-        name = f'{one.name} as stated'
-        yield GateCheck(name, '', math.nan, math.nan, '', one.passed, one.note)
+        yield _fact(f'{one.name} as stated', one.note, one.passed)
     wrong = [one.name for one in found.statements if one.passed is False]
     # A distance that the evidence does not decide on may be the cause all the same.
     wrong += [t.name for t in found.held if t.distance > options.max_held_term_sigma]

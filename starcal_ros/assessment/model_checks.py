@@ -9,20 +9,23 @@ what was left out.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+import dataclasses
 import math
 
 import numpy as np
 from scipy.special import ndtr
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Mask
 from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.estimation.limits import FREE_FACTOR
 from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.estimation.shared_errors import coarsest_cell_px
-from starcal_ros.estimation.unknowns import CHANGE
+from starcal_ros.estimation.unknowns import CHANGE, Layout, Unknown
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
 _STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
@@ -106,53 +109,62 @@ def _held_terms(estimate: Estimate) -> tuple[HeldTerm, ...]:
     not determine is listed too, with NaN.
     """
     clear_sigma = GateOptions.max_held_term_sigma
-    found, layout, problem = estimate.posterior, estimate.linear.layout, estimate.linear.problem
-    terms = []
-    camera = np.arange(layout.count)[layout.places['camera']]
-    for k in np.setdiff1d(camera, found.estimated):
-        own = int(k - camera[0])
-        means, variances, _ = without_prior(estimate.sums, estimate.linear, 'camera', found, own)
-        held, shown = float(estimate.linear.state.parameters[own]), _or_nan(variances[own])
-        by_stars = held + float(means[own]) + 0.0 * shown
-        terms.append(HeldTerm(layout.labels[k], held, by_stars, math.sqrt(shown)))
+    found, linear = estimate.posterior, estimate.linear
+    layout, prior_camera = linear.layout, linear.problem.prior_parameters
     total, working = np.diag(found.covariance), np.diag(found.working)
     mountings = {
         f'star_tracker_{k}_{axis}': (f'mounting of {one.frame} {axis}_deg', math.degrees(1.0))
         for k, one in enumerate(estimate.star_trackers, 1)
         for axis in 'xyz'
     }
-    for entry in layout.shared:
-        at = layout.of([entry.name])
-        tested = np.isin(at, found.estimated) & (layout.prior_precision[at] > 0)
-        tested &= entry.widest > entry.sigma  # nobody states a prior as wide as any lens needs
-        test = entry.kind.tested
-        if test is None or not tested.any():
-            continue
-        means, variances, log_evidence = without_prior(
-            estimate.sums, estimate.linear, entry.name, found
-        )
+    terms = []
+    for entry, freed, tested in _without_priors(layout):
+        assert entry.kind.tested is not None
+        means, variances, log_evidence = without_prior(estimate.sums, linear, freed, found)
         gained = log_evidence - found.log_evidence
-        for k, mean, variance in zip(at[tested], means[tested], variances[tested], strict=True):
-            shown = _or_nan(variance)
-            off = float(layout.prior_offset[k] + mean) + 0.0 * shown
+        for own in np.flatnonzero(tested):
+            k = layout.places[entry.name].start + own
+            shown = float(variances[own]) if math.isfinite(variances[own]) else math.nan
+            off = float(layout.prior_offset[k] + means[own]) + 0.0 * shown
+            is_held = entry.sigma[own] == 0
             # Errors that observations share are in both variances.
-            prior2 = min(1.0 / layout.prior_precision[k], entry.plausible_sigma**2)
-            sigma = math.sqrt(prior2 + shown * total[k] / working[k])
+            by_stars2 = shown if is_held else shown * total[k] / working[k]
+            sigma = math.sqrt(min(entry.sigma[own], entry.plausible_sigma) ** 2 + by_stars2)
             is_far = math.isinf(entry.plausible_sigma) and abs(off) > clear_sigma * sigma
-            evidence = gained if is_far and not gained > 0.5 * clear_sigma**2 else math.nan
+            is_decided = is_held or gained > 0.5 * clear_sigma**2
+            evidence = gained if is_far and not is_decided else math.nan
             # What is not in the state is zero there, so far from its prior mean.
             prior = 0.0 if entry.turn is None else 0.0 - float(layout.prior_offset[k])
-            if k in camera:
-                prior = float(problem.prior_parameters[k - camera[0]])
+            if entry.name == 'camera':
+                prior = float(prior_camera[own])
             label = layout.labels[k]
-            name, unit = {**mountings, **test.as_stated}.get(label, (label, 1.0))
+            name, unit = {**mountings, **entry.kind.tested.as_stated}.get(label, (label, 1.0))
             terms.append(HeldTerm(name, prior, prior + unit * off, unit * sigma, evidence))
     return tuple(terms)
 
 
-def _or_nan(variance: float) -> float:
-    """Return a variance; NaN where it is infinite."""
-    return float(variance) if math.isfinite(variance) else math.nan
+def _without_priors(layout: Layout) -> Iterator[tuple[Unknown, Unknown, Mask]]:
+    """
+    Yield entries, the same with one of their numbers free or all, and which of these it tests.
+
+    A number that is held is free alone, those with a prior all together.
+    """
+    for entry in layout.shared:
+        if entry.kind.tested is None:
+            continue
+        is_held = entry.sigma == 0
+        for alone in np.eye(len(entry), dtype=bool)[is_held]:
+            yield (
+                entry,
+                dataclasses.replace(entry, sigma=np.where(alone, np.inf, entry.sigma)),
+                alone,
+            )
+        widest = np.minimum(FREE_FACTOR * entry.sigma, entry.widest)
+        # Nobody states a prior as wide as any lens needs.
+        tested = ~is_held & np.isfinite(entry.sigma) & (entry.widest > entry.sigma)
+        if tested.any():
+            sigma = np.maximum(entry.sigma, widest)
+            yield entry, dataclasses.replace(entry, sigma=sigma), tested
 
 
 def detector_step(estimate: Estimate) -> DetectorStep:
@@ -166,7 +178,7 @@ def detector_step(estimate: Estimate) -> DetectorStep:
     camera = estimate.geometry.camera
     strip_px = coarsest_cell_px(camera.width)
     residual_px = estimate.residual_px[kept]
-    weight = 2.0 / (estimate.covariance_px2[kept, 0] + estimate.covariance_px2[kept, 2])
+    weight = 1.0 / estimate.weights.variance_px2[kept]
     best, best_significance, trials = ('u', 0.0, 'u', 0.0), 0.0, 0
     for axis, size in enumerate((camera.width, camera.height)):
         inner_px = (1.0 - 2.0 * _MARGIN) * size

@@ -23,6 +23,7 @@ from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.amplitudes import LogPrior, STARTS_PX
+from starcal_ros.estimation.centroid_variance import CentroidVariance
 from starcal_ros.estimation.equations import Linearisation, star_sums, StarSums
 from starcal_ros.estimation.image_rotations import sky_rotations, turned
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
@@ -38,7 +39,7 @@ from starcal_ros.estimation.posterior import (
     is_settled,
     Posterior,
     posterior,
-    Weights,
+    Weighting,
     with_shared_errors,
 )
 from starcal_ros.estimation.problem import (
@@ -67,21 +68,19 @@ from starcal_ros.estimation.tracker_errors import (
 )
 from starcal_ros.estimation.unknowns import (
     Assumptions,
+    EntryInputs,
     FIELD_OCTAVES,
     IMAGE_ROTATION,
     Layout,
     moved,
-    readout_rms_s,
     unknowns_of,
 )
 from starcal_ros.estimation.weights import (
-    CentroidVariance,
     Data,
     degrees_of_freedom,
     judge,
     tracker_attitudes,
     weighted_attitudes,
-    Weighting,
 )
 from starcal_ros.records import (
     CameraGeometry,
@@ -124,16 +123,13 @@ class Estimate:
         The last one: the state is the one before the last step.
     sums : StarSums
     posterior : Posterior
-    weights : Weights
+    weights : Weighting
+        Those with which the last round was made.
     table : StarTable
     kept : (n,) bool
         Observations used.
     residual_px : (n, 2)
         Residuals of all observations, with all unknowns at their means.
-    covariance_px2 : (n, 3)
-        Variance of each observation: noise, and the errors it shares with others.
-    variance : CentroidVariance
-        How the centroid covariances were corrected.
     variance_factor : float
         chi^2 per degree of freedom of the centroid covariances as given.
     star_tracker_sigma_rad : (3,)
@@ -162,12 +158,10 @@ class Estimate:
     linear: Linearisation
     sums: StarSums
     posterior: Posterior
-    weights: Weights
+    weights: Weighting
     table: StarTable
     kept: Mask
     residual_px: Floats
-    covariance_px2: Floats
-    variance: CentroidVariance
     variance_factor: float
     star_tracker_sigma_rad: Floats
     misfit_image: Mask
@@ -235,32 +229,28 @@ def estimate_calibration(
 def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) -> Estimate:
     """Return the estimate from a start."""
     table = data.table
-    judged = Weighting(
-        CentroidVariance(1.0, _START_FLOOR_PX**2), (), np.ones(len(table), bool), None
-    )
-    measurements = arrange(table, judged.kept, judged.covariance_px2(table))
+    variance, every = CentroidVariance(1.0, _START_FLOOR_PX**2), np.ones(len(table), bool)
+    covariance_px2 = variance.of(table.covariance_px2, table.magnitude)
+    measurements = arrange(table, every, covariance_px2)
     solution = _robust_search(problem, start, measurements)
     state, iterations = solution.state, solution.iterations
     _check_not_mirrored(state)
     residual_px = residuals_px(problem, state, table)
     from_sky = sky_rotations(state, table, data.prior.camera)
-    judged = judge(data, from_sky, residual_px, np.full(len(table), 2.0), judged, None)
-    shape_px: Floats | float = STARTS_PX[0]
+    judged = Weighting(table, from_sky, variance, (), every, None)
+    judged = judge(data, residual_px, np.full(len(table), 2.0), judged, None)
     before: _Round | None = None
     termination = 'iteration_limit'
     share = 1.0
     before_sigma: Floats = np.empty(0)
     for k in range(MOST_ROUNDS):
-        last = _round(data, problem, state, judged, residual_px, shape_px, before, share)
+        last = _round(data, problem, state, judged, residual_px, before, share)
         iterations += 1
         if before and is_settled(last.posterior, before.posterior):
             termination = 'converged'
             break
-        after = judge(
-            data, from_sky, last.residual_px, last.freedom, judged, last.posterior, last.attitudes
-        )
+        after = judge(data, last.residual_px, last.freedom, judged, last.posterior, last.attitudes)
         residual_px, before = last.residual_px, last
-        shape_px = np.maximum(last.posterior.shapes.sigma_px, STARTS_PX[0])
         if k < MOST_ROUNDS - 1:
             state, judged = last.after, after
         # Steps of unknowns that stars hardly show oscillate: the ratio of successive steps damps
@@ -271,14 +261,7 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
             rest = float(step_sigma @ before_sigma) / of_before
             share = min(max(share / max(1.0 - rest, share), _LEAST_SHARE), 1.0)
         before_sigma = step_sigma
-    weights = Weights(
-        judged.covariance_px2(table)[:, [0, 2]].mean(axis=1),
-        judged.inflation_px2(table),
-        from_sky,
-        judged.errors,
-        last.attitudes.trackers,
-    )
-    return _result(data, ensemble, last, judged, weights, iterations, termination)
+    return _result(data, ensemble, last, judged, iterations, termination)
 
 
 @dataclass(frozen=True)
@@ -300,7 +283,6 @@ def _round(
     state: State,
     judged: Weighting,
     residual_px: Floats,
-    shape_px: Floats | float,
     before: _Round | None,
     share: float,
 ) -> _Round:
@@ -308,16 +290,15 @@ def _round(
     table, camera = data.table, data.prior.camera
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
     size = camera.width, camera.height
-    readout_s = math.hypot(*data.assumed.readout_s)
-    if before:
-        last = before.posterior
-        readout_s = readout_rms_s(last.layout, last.mean, last.working, data.assumed)
+    near = before.posterior if before else None
+    readout_s = _readout_rms_s(data.assumed, near)
     rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
-    layout = unknowns_of(problem, state, rates, size, data.assumed)
-    measurements = arrange(table, judged.kept, judged.working_px2(table))
+    layout = unknowns_of(EntryInputs(problem, state, rates, size, data.assumed))
+    measurements = arrange(table, judged.kept, judged.working_px2)
     linear = Linearisation(problem, state, layout, measurements, table.measured_px - residual_px)
     sums = star_sums(linear)
-    found = posterior(sums, linear, shape_px, before.posterior if before else None)
+    shape_px = np.maximum(near.shapes.sigma_px, STARTS_PX[0]) if near else STARTS_PX[0]
+    found = posterior(sums, linear, shape_px, near)
     # Unknowns outside the state, such as a velocity, take their mean; the images follow both.
     shared = found.mean.copy()
     shared[layout.in_state] *= share
@@ -327,6 +308,14 @@ def _round(
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, taken, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
+
+
+def _readout_rms_s(assumed: Assumptions, near: Posterior | None) -> float:
+    """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
+    if near is None or not {'rates', 'readout'} <= set(near.layout.places):
+        return math.hypot(*assumed.readout_s)
+    at = near.layout.places['readout'].start
+    return math.hypot(near.mean[at], near.working[at, at] ** 0.5)
 
 
 def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
@@ -426,17 +415,16 @@ def _result(
     data: Data,
     ensemble: Ensemble,
     last: _Round,
-    judged: Weighting,
-    weights: Weights,
+    weights: Weighting,
     iterations: int,
     termination: str,
 ) -> Estimate:
-    """Return the estimate of the last round, which was made with the weights judged."""
+    """Return the estimate of the last round, which was made with the weights."""
     table, options, prior = data.table, data.options, data.prior
     size = prior.camera.width, prior.camera.height
-    linear, after, attitudes, kept = last.linear, last.after, last.attitudes, judged.kept
+    linear, after, attitudes, kept = last.linear, last.after, last.attitudes, weights.kept
     problem, layout, residual_px = linear.problem, linear.layout, last.residual_px
-    found = with_shared_errors(last.posterior, last.sums, linear, weights)
+    found = with_shared_errors(last.posterior, last.sums, linear, weights, attitudes.trackers)
     free = {problem.parameter_names[i]: float(after.parameters[i]) for i in problem.free}
     try:
         camera = dataclasses.replace(prior.camera, field=_field_of(found, size)).replace(**free)
@@ -464,7 +452,7 @@ def _result(
         geometry=geometry,
         covariance=covariance[np.ix_(basic, basic)],
         map_covariance=MapCovariance(
-            covariance[np.ix_(joint, joint)], math.sqrt(pixel_variance_px2(judged.errors))
+            covariance[np.ix_(joint, joint)], math.sqrt(pixel_variance_px2(weights.errors))
         ),
         information=found.equations.information[np.ix_(asked, asked)],
         information_names=tuple(layout.labels[k] for k in asked),
@@ -477,8 +465,6 @@ def _result(
         table=table,
         kept=kept,
         residual_px=residual_px,
-        covariance_px2=judged.covariance_px2(table),
-        variance=judged.variance,
         variance_factor=float(chi2_given / max(float(last.freedom[kept].sum()), 1e-9)),
         star_tracker_sigma_rad=noise * data.stated_rad,
         misfit_image=attitudes.misfit | lost,

@@ -15,13 +15,18 @@ arrow: ``N = [A, B_k'; B_k, C_k]``, right-hand side ``[a; c_k]``.  The images ar
 from __future__ import annotations
 
 from collections.abc import Iterator
+import dataclasses
 from dataclasses import dataclass
-import functools
 
 import numpy as np
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.estimation.levenberg_marquardt import inverse, NormalEquations, NotObservable
+from starcal_ros.estimation.levenberg_marquardt import (
+    eliminated,
+    Equations,
+    NormalEquations,
+    NotObservable,
+)
 from starcal_ros.estimation.problem import (
     image_parameters,
     Problem,
@@ -95,36 +100,6 @@ def _chained(
     return StarSums(E.transpose(0, 2, 1) @ blocks @ E, field, cross @ E)
 
 
-@dataclass(frozen=True)
-class Equations:
-    """
-    Arrow of normal equations with the images eliminated.
-
-    Attributes
-    ----------
-    information : (P, P)
-        S on the shared unknowns without their priors.
-    gradient : (P,)
-    cross : (m, b, P)
-        ``B_k``.
-    own : (m, b)
-        ``C_k^-1 c_k``.
-    covariance : (m, b, b)
-        ``C_k^-1``: of the unknowns of an image, the shared ones known.
-    """
-
-    information: Floats
-    gradient: Floats
-    cross: Floats
-    own: Floats
-    covariance: Floats
-
-    @functools.cached_property
-    def back(self) -> Floats:
-        """``C_k^-1 B_k`` (m, b, P): unknowns of an image follow the shared by ``own - back x``."""
-        return np.asarray(self.covariance @ self.cross)
-
-
 def star_columns(linear: Linearisation) -> Iterator[tuple[Chunk, Floats]]:
     """
     Yield each chunk with its whitened columns (2, c, m n), which the next one overwrites.
@@ -173,7 +148,7 @@ def star_rows(
     layout = linear.layout
     E = chain(linear.problem, layout, linear.measurements.image_count).transpose(0, 2, 1)
     at, field = seen_by_stars(layout), layout.field_at
-    functions = layout.field.functions
+    functions = layout['field'].functions
     assert functions is not None
     (seen, to), (of_u, to_u), (of_v, to_v) = (
         (places := np.flatnonzero(np.isin(of, part)), np.searchsorted(part, of[places]))
@@ -215,7 +190,7 @@ def weighted_rows_by(
     layout = linear.layout
     E, at = chain(linear.problem, layout, linear.measurements.image_count), seen_by_stars(layout)
     by_root = E[:, :, : len(at)] @ root[at] + E[:, :, len(at) : -1] @ of_images
-    functions, r = layout.field.functions, root.shape[1]
+    functions, r = layout['field'].functions, root.shape[1]
     assert functions is not None
     of_field = np.concatenate(np.split(root[layout.field_at], 2), axis=1)
     for chunk, Z in star_columns(linear):
@@ -325,23 +300,15 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
 def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats | float) -> Equations:
     """Return the normal equations of `arrow` with the images eliminated."""
     normal = arrow(sums, linear.problem, linear.state, linear.layout)
-    return eliminated(normal, linear.layout, shape_sigma_px)
+    return without_images(normal, linear.layout, shape_sigma_px)
 
 
-def eliminated(
+def without_images(
     normal: NormalEquations, layout: Layout, shape_sigma_px: Floats | float
 ) -> Equations:
     """Return the same; ``shape_sigma_px`` (s,) is the prior of the shapes of the images."""
-    m, b, P = normal.B.shape
-    C = normal.C
-    C = C + np.diag(layout.image_precision(shape_sigma_px))
-    covariance = inverse(C)
-    # The product of a matrix and its transpose takes half the time of that of any two.
-    root = (np.linalg.cholesky(covariance).transpose(0, 2, 1) @ normal.B).reshape(m * b, P)
-    own = np.einsum('mij,mj->mi', covariance, normal.c)
-    gradient = normal.a - normal.B.reshape(m * b, P).T @ own.ravel()
-    information = normal.A - root.T @ root
-    return Equations(0.5 * (information + information.T), gradient, normal.B, own, covariance)
+    C = normal.C + np.diag(layout.image_precision(shape_sigma_px))
+    return eliminated(dataclasses.replace(normal, C=C))
 
 
 def information_of_images(

@@ -18,7 +18,9 @@ Levenberg-Marquardt.  A step is accepted by the same cost whose gradient gave th
 from __future__ import annotations
 
 from collections.abc import Callable
+import dataclasses
 from dataclasses import dataclass
+import functools
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -48,6 +50,36 @@ class NormalEquations:
     B: Floats
     C: Floats
     c: Floats
+
+
+@dataclass(frozen=True)
+class Equations:
+    """
+    An arrow with its blocks eliminated.
+
+    Attributes
+    ----------
+    information : (p, p)
+        S on the shared unknowns.
+    gradient : (p,)
+    cross : (m, q, p)
+        ``B_k``.
+    own : (m, q)
+        ``C_k^-1 c_k``.
+    covariance : (m, q, q)
+        ``C_k^-1``: of the unknowns of a block, the shared ones known.
+    """
+
+    information: Floats
+    gradient: Floats
+    cross: Floats
+    own: Floats
+    covariance: Floats
+
+    @functools.cached_property
+    def back(self) -> Floats:
+        """``C_k^-1 B_k`` (m, q, p): unknowns of a block follow the shared by ``own - back s``."""
+        return np.asarray(self.covariance @ self.cross)
 
 
 @dataclass(frozen=True)
@@ -100,6 +132,25 @@ def inverse(matrix: Floats) -> Floats:
     return np.asarray(scale[..., :, None] * scaled * scale[..., None, :])
 
 
+def eliminated(normal: NormalEquations) -> Equations:
+    """
+    Return the normal equations with the blocks eliminated.
+
+    Raises
+    ------
+    NotObservable
+        If a block is not positive definite.
+    """
+    m, q, p = normal.B.shape
+    covariance = inverse(normal.C)
+    # The product of a matrix and its transpose takes half the time of that of any two.
+    root = (np.linalg.cholesky(covariance).transpose(0, 2, 1) @ normal.B).reshape(m * q, p)
+    own = np.einsum('mij,mj->mi', covariance, normal.c)
+    gradient = normal.a - normal.B.reshape(m * q, p).T @ own.ravel()
+    information = normal.A - root.T @ root
+    return Equations(0.5 * (information + information.T), gradient, normal.B, own, covariance)
+
+
 def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats]:
     """
     Step (p,) and (m, q) of ``(N + damping diag N) step = [a; c]`` by block elimination (Eq. 25).
@@ -110,19 +161,12 @@ def solve_arrow(normal: NormalEquations, damping: float) -> tuple[Floats, Floats
         When the matrix is not positive definite, or the elimination of the blocks leaves less
         information on a shared unknown than rounding.
     """
-    p = len(normal.a)
-    A = normal.A + damping * np.diag(np.diag(normal.A))
-    q = normal.C.shape[-1]
-    C = normal.C * (1.0 + damping * np.eye(q))
-    C_inverse = inverse(C)
-    W = C_inverse @ normal.B
-    w = np.einsum('mij,mj->mi', C_inverse, normal.c)
-    flat_B = normal.B.reshape(len(normal.B) * q, p)
-    S = A - flat_B.T @ W.reshape(flat_B.shape)
-    if (np.diag(S) < ROUNDING * np.diag(A)).any():
+    A, C = (one * (1.0 + damping * np.eye(one.shape[-1])) for one in (normal.A, normal.C))
+    left = eliminated(dataclasses.replace(normal, A=A, C=C))
+    if (np.diag(left.information) < ROUNDING * np.diag(A)).any():
         raise NotObservable('a shared unknown cannot be separated from the blocks')
-    shared = inverse(S) @ (normal.a - flat_B.T @ w.ravel())
-    return shared, w - W @ shared
+    shared = inverse(left.information) @ left.gradient
+    return shared, left.own - left.back @ shared
 
 
 def levenberg_marquardt(

@@ -9,7 +9,7 @@ give the same precision, and enter the covariance exactly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 import dataclasses
 from dataclasses import dataclass
 import functools
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import solve
 from scipy.sparse import csr_array
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.amplitudes import (
     Amplitudes,
     averaged_field,
@@ -31,22 +31,23 @@ from starcal_ros.estimation.amplitudes import (
     ShapeSums,
     STARTS_PX,
 )
+from starcal_ros.estimation.centroid_variance import CentroidVariance
 from starcal_ros.estimation.equations import (
     arrow,
     chain_columns,
-    eliminated,
-    Equations,
     Linearisation,
     seen_by_stars,
     StarSums,
     tracker_turns,
     weighted_rows_by,
+    without_images,
 )
-from starcal_ros.estimation.levenberg_marquardt import inverse, NotObservable
+from starcal_ros.estimation.levenberg_marquardt import Equations, inverse, NotObservable
 from starcal_ros.estimation.limits import FREE_FACTOR, NEGLIGIBLE, STEP_SIGMA
 from starcal_ros.estimation.problem import whitened_attitude_errors
-from starcal_ros.estimation.shared_errors import group_sums, SharedError
-from starcal_ros.estimation.tracker_errors import TrackerErrors
+from starcal_ros.estimation.shared_errors import group_sums, SharedError, star_shares_px2
+from starcal_ros.estimation.star_equations import StarTable
+from starcal_ros.estimation.tracker_errors import AttitudeErrors, TrackerErrors
 from starcal_ros.estimation.unknowns import CHANGE, IMAGE_ROTATION, Layout, Unknown
 
 
@@ -152,9 +153,9 @@ def posterior(
         At a state near this one: the search of amplitudes begins with its own.
     """
     layout = linear.layout
-    before = np.broadcast_to(before, len(layout.shape))
+    before = np.broadcast_to(before, len(layout['shape']))
     normal = arrow(sums, linear.problem, linear.state, layout)
-    start = eliminated(normal, layout, before)
+    start = without_images(normal, layout, before)
     solver = _Solver(layout)
     base, field_px = solver.likely(start, near.field if near else None)
     none = Amplitudes(np.full(len(before), math.log(LEAST_PX)), 0.0)
@@ -162,7 +163,7 @@ def posterior(
     if len(sums.blocks) > 1:
         by_image = _shape_sums(sums, linear, solver, field_px)
         found = shapes(by_image, near.shapes.amplitudes if near else None)
-        last = eliminated(normal, layout, found.sigma_px)
+        last = without_images(normal, layout, found.sigma_px)
     mean, covariance, last_octave, term, log_evidence = solver.solve(last, base)
     # The unknowns of the images, eliminated, and the prior of their amplitudes.
     log_evidence += 0.5 * float(np.linalg.slogdet(last.covariance)[1].sum())
@@ -187,17 +188,16 @@ def posterior(
 
 
 def without_prior(
-    sums: StarSums, linear: Linearisation, name: str, near: Posterior, held: int | None = None
+    sums: StarSums, linear: Linearisation, freed: Unknown, near: Posterior
 ) -> tuple[Floats, Floats, float]:
     """
     Return mean and variance (q,) of the unknowns of an entry without its prior, and log evidence.
 
-    With ``held`` only that number of the entry, which is held, is free.
-
-    The amplitudes are estimated again: field and shapes may hide that a prior is wrong.  A free
-    trend and a free velocity would absorb errors of the lens, so the trend keeps its value of the
-    posterior ``near`` with the prior, and its cost.  The variance is that of the working weights;
-    infinite where stars show less than what is possible at all.
+    ``freed`` is the entry with the sigmas that are to hold in place of its prior.  The amplitudes
+    are estimated again: field and shapes may hide that a prior is wrong.  A free trend and a free
+    velocity would absorb errors of the lens, so the trend keeps its value of the posterior
+    ``near`` with the prior, and its cost.  The variance is that of the working weights; infinite
+    where stars show less than what is possible at all.
     """
     at_trend = linear.layout.trend_at
     trend, stated = near.mean[at_trend], linear.layout.prior_precision[at_trend]
@@ -206,15 +206,15 @@ def without_prior(
     )
     entries = []
     for entry in linear.layout.entries:
-        if entry.name == name:
-            entry = dataclasses.replace(entry, sigma=_without_prior(entry, held))
+        if entry.name == freed.name:
+            entry = freed
         elif entry.kind.cause == CHANGE and not entry.of_image:
             kept = near.mean[linear.layout.places[entry.name]]
             entry = dataclasses.replace(entry, sigma=entry.sigma / FREE_FACTOR, offset=-kept)
         entries.append(entry)
     wide = Layout(tuple(entries))
     linear = dataclasses.replace(linear, layout=wide)
-    at = wide.of([name])
+    at = wide.of([freed.name])
     try:
         found = posterior(sums, linear)
     except (NotObservable, np.linalg.LinAlgError):  # its prior alone determines it
@@ -229,14 +229,6 @@ def without_prior(
     return np.where(seen, alone, 0.0), variance, found.log_evidence - cost
 
 
-def _without_prior(entry: Unknown, held: int | None) -> Floats:
-    """Return the sigma (q,) of an entry without its prior: the largest possible."""
-    if held is not None:
-        return np.where(np.arange(len(entry)) == held, np.inf, entry.sigma)
-    widest = np.minimum(FREE_FACTOR * entry.sigma, entry.widest)
-    return np.asarray(np.maximum(entry.sigma, widest))
-
-
 class _Solver:
     """Solution of the shared unknowns: the field by its amplitudes, the others by their priors."""
 
@@ -246,7 +238,7 @@ class _Solver:
         self.field = layout.field_at
         self.free = np.setdiff1d(np.flatnonzero(np.isfinite(self.precision)), self.field)
         self.estimated = np.concatenate([self.free, self.field])
-        field = layout.field
+        field = layout['field']
         assert field.octave is not None and field.term is not None
         self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
         self.first = field.log_px
@@ -328,13 +320,13 @@ def _shape_sums(
     others = columns[rotation]
     weak = np.where(size > 0, 1e-9 * size, 1.0)[:, None] * np.ones(3)
     for entry in layout.of_image:
-        if entry is not layout.shape:
+        if entry.name != 'shape':
             others = np.concatenate([others, columns[own][layout.places[entry.name]]])
             weak = np.concatenate([weak, np.tile(entry.sigma**-2.0, (len(weak), 1))], axis=1)
     C = blocks[:, others[:, None], others] + weak[:, :, None] * np.eye(len(others))
     back = np.linalg.solve(C, blocks[:, others])
     left = blocks - blocks[:, others].transpose(0, 2, 1) @ back
-    shape, total = columns[own][layout.shape_at], left.sum(axis=0)
+    shape, total = columns[own][layout.places['shape']], left.sum(axis=0)
     at = seen_by_stars(layout)  # the first columns
     precision, offset = solver.precision[at], layout.prior_offset[at]
     free = np.flatnonzero(np.isfinite(precision) & ~np.isin(at, layout.trend_at))
@@ -350,7 +342,7 @@ def _shape_sums(
 
 def common_shape(layout: Layout, common_px2: Floats) -> Floats:
     """Return the covariance (P, P) of the shapes that all images share, by the camera."""
-    camera, shapes = layout.places['camera'], layout.shape.camera
+    camera, shapes = layout.places['camera'], layout['shape'].camera
     assert shapes is not None
     free = np.isfinite(layout.prior_precision[camera])
     modes = shapes[0] * free[:, None]
@@ -363,26 +355,59 @@ TRACKER_NOISE, TRACKER_SLOW = 'star tracker noise', 'star tracker slow error'
 
 
 @dataclass(frozen=True)
-class Weights:
+class Weighting:
     """
-    Covariances of the observations as they are weighted, and the errors that they share.
+    Conclusions from the residuals of a round: the weights of the next one.
 
     Attributes
     ----------
-    variance_px2 : (n,)
-        Variance of each observation per axis.
-    inflation_px2 : (n,)
-        Variance per axis that the working weights have beyond that of each observation.
+    table : StarTable
+        Its n observations are weighted.
     from_sky : (n, 2, 2)
+        Rotation of a displacement fixed to the star into pixel axes.
+    variance : CentroidVariance
+        How the centroid covariances are corrected.
     errors : tuple of SharedError
-    trackers : tuple of TrackerErrors
+    kept : (n,) bool
+        Observations that are used.
+    attitudes : AttitudeErrors or None
+        None before the first round.
     """
 
-    variance_px2: Floats
-    inflation_px2: Floats
+    table: StarTable
     from_sky: Floats
+    variance: CentroidVariance
     errors: tuple[SharedError, ...]
-    trackers: tuple[TrackerErrors, ...]
+    kept: Mask
+    attitudes: AttitudeErrors | None
+
+    @functools.cached_property
+    def covariance_px2(self) -> Floats:
+        """Covariances (n, 3) of the observations: noise, and errors that a star alone has."""
+        covariance_px2 = self.variance.of(self.table.covariance_px2, self.table.magnitude)
+        beyond_px2 = np.broadcast_to(star_shares_px2(self.errors)[1], len(self.table))
+        return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
+
+    @functools.cached_property
+    def variance_px2(self) -> Floats:
+        """Variance (n,) of the observations per axis."""
+        return np.asarray(self.covariance_px2[:, [0, 2]].mean(axis=1))
+
+    @functools.cached_property
+    def inflation_px2(self) -> Floats:
+        """
+        Variance (n,) by which the weights are lower for errors that images share.
+
+        With it, k images of a star weigh as the mean of theirs does.
+        """
+        star = self.table.star
+        sightings = np.bincount(star, self.kept, int(star.max()) + 1)[star]
+        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_shares_px2(self.errors)[0])
+
+    @property
+    def working_px2(self) -> Floats:
+        """Covariances (n, 3) whose inverses are the weights."""
+        return self.covariance_px2 + np.outer(self.inflation_px2, [1.0, 0.0, 1.0])
 
 
 def is_settled(found: Posterior, before: Posterior) -> bool:
@@ -406,7 +431,8 @@ def with_shared_errors(
     found: Posterior,
     sums: StarSums,
     linear: Linearisation,
-    weights: Weights,
+    weights: Weighting,
+    trackers: Sequence[TrackerErrors],
     negligible: float = NEGLIGIBLE,
 ) -> Posterior:
     """
@@ -418,7 +444,7 @@ def with_shared_errors(
     layout = linear.layout
     root, held = _root(found.working, found.estimated, sums, layout, negligible)
     excess, shared = _of_observations(found, linear, weights, root)
-    of_attitudes, by_tracker = _of_attitudes(found, linear, weights, root)
+    of_attitudes, by_tracker = _of_attitudes(found, linear, trackers, root)
     excess += of_attitudes
     none = (0, held.shape[1])  # errors of the modes that priors hold
     return dataclasses.replace(
@@ -460,7 +486,7 @@ def _root(
 
 
 def _of_observations(
-    found: Posterior, linear: Linearisation, weights: Weights, root: Floats
+    found: Posterior, linear: Linearisation, weights: Weighting, root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """
     Return ``L' X' W (V - 1/W) W X L`` (r, r) of the observations, and the errors that they share.
@@ -480,7 +506,7 @@ def _of_observations(
 
 
 def _of_attitudes(
-    found: Posterior, linear: Linearisation, weights: Weights, root: Floats
+    found: Posterior, linear: Linearisation, trackers: Sequence[TrackerErrors], root: Floats
 ) -> tuple[Floats, dict[str, Floats]]:
     """Return the same (r, r) of the star-tracker attitudes, by noise and slow errors."""
     _, J = whitened_attitude_errors(linear.problem, linear.state)
@@ -489,7 +515,7 @@ def _of_attitudes(
     r = root.shape[1]
     working, noise, slow = np.zeros((3, r, r))
     sigma_rad = linear.problem.star_tracker_sigma_rad
-    for tracker in weights.trackers:
+    for tracker in trackers:
         group, images = tracker.group, tracker.images
         to_working2 = (tracker.sigma_rad / sigma_rad[images[0], tracker.axes[0]]) ** 2
         shared = tracker.covariance - tracker.independent * np.eye(len(tracker.covariance))

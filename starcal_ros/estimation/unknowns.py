@@ -204,25 +204,10 @@ class Layout:
         places = [np.arange(self.count)[self.places[name]] for name in names if name in self]
         return np.concatenate([np.empty(0, np.int64), *places])
 
-    @property
-    def field(self) -> Unknown:
-        """Entry of the field over the detector."""
-        return self['field']
-
     @functools.cached_property
     def field_at(self) -> Indices:
         """Places of the coefficients of the field; none in a list without it."""
         return self.of(['field'])
-
-    @property
-    def shape(self) -> Unknown:
-        """Entry of the changes of the camera from image to image."""
-        return self['shape']
-
-    @property
-    def shape_at(self) -> slice:
-        """Place of the shape among the unknowns of an image."""
-        return self.places['shape']
 
     @functools.cached_property
     def trend_at(self) -> Indices:
@@ -399,7 +384,11 @@ def moved(
 
 @dataclass(frozen=True)
 class EntryInputs:
-    """Inputs of the entries: rates in the frame of the camera, size of the detector, px."""
+    """
+    Inputs of the entries of a calibration at a state.
+
+    ``rates`` are in the frame of the camera; ``size`` is that of the detector, (width, height) px.
+    """
 
     problem: Problem
     state: State
@@ -413,48 +402,11 @@ class EntryInputs:
         return np.asarray(self.state.camera_from_icrf.as_matrix())
 
 
-def unknowns_of(
-    problem: Problem,
-    state: State,
-    rates: Rates,
-    size: tuple[int, int],
-    assumed: Assumptions,
-) -> Layout:
-    """
-    Return the list of unknowns of a calibration at a state.
-
-    Parameters
-    ----------
-    rates : Rates
-        In the frame of the camera.
-    size : (width, height)
-        Of the detector, px.
-    """
-    given = EntryInputs(problem, state, rates, size, assumed)
+def unknowns_of(given: EntryInputs) -> Layout:
+    """Return the list of unknowns of a calibration at a state."""
     made = (kind.make(given) for kind in UNKNOWNS.values() if kind.make is not None)
-    entries = *unknowns_in_state(problem, state).entries, *made
+    entries = *unknowns_in_state(given.problem, given.state).entries, *made
     return Layout(tuple(entry for entry in entries if entry is not None and len(entry)))
-
-
-def like(layout: Layout, rates: Rates, air: Refraction | None) -> tuple[Rates, Assumptions]:
-    """
-    Return rates and assumptions that give images at rest the columns of a list.
-
-    The sigmas are of no account: the information of the priors is in the list already.
-    """
-    readout, stamps = (float(len(layout.of([name])) > 1) for name in ('readout', 'stamps'))
-    if readout or stamps:  # three turns, since no image has a rate
-        rates = dataclasses.replace(rates, rad_s=np.full_like(rates.rad_s, np.nan))
-    air = air if len(layout.of(['site'])) == 2 else None  # latitude and one clock
-    return rates, Assumptions(float('velocity' in layout), (0.0, readout), stamps, air)
-
-
-def readout_rms_s(layout: Layout, mean: Floats, covariance: Floats, assumed: Assumptions) -> float:
-    """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
-    if not {'rates', 'readout'} <= set(layout.places):
-        return math.hypot(*assumed.readout_s)
-    at = layout.places['readout'].start
-    return math.hypot(mean[at], covariance[at, at] ** 0.5)
 
 
 def _shape(given: EntryInputs) -> Unknown:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.centroid_variance import CentroidVariance, estimate_variance
 from starcal_ros.estimation.equations import (
     chain,
     chain_columns,
@@ -30,10 +30,10 @@ from starcal_ros.estimation.equations import (
     StarSums,
 )
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
-from starcal_ros.estimation.limits import FREE_FACTOR, MOST_ROUNDS, ROUNDING, STEP_SIGMA
+from starcal_ros.estimation.limits import FREE_FACTOR
 from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.outliers import fitting_stars, misfit_images, QUARTILE
-from starcal_ros.estimation.posterior import Posterior
+from starcal_ros.estimation.posterior import Posterior, Weighting
 from starcal_ros.estimation.problem import (
     attitude_errors,
     image_alignment,
@@ -59,146 +59,6 @@ from starcal_ros.estimation.unknowns import Assumptions
 from starcal_ros.records import CameraGeometry
 
 EXACT_RAD = 1e-3 * ARCSECOND_RAD  # sigma in Method 2, which takes the star tracker as exact
-_SCALE_LIMITS = (0.05, 400.0)  # data without noise, and centroids whose covariance means nothing
-# Nodes of the factor as a function of magnitude, at quantiles.  Without that function, halves of
-# two real sets differ by 1.19 and 1.92 of their sigma, with it by 1.01 and 1.75.
-_NODES = 5
-_BINS = 500  # bins of magnitude, in which that function is constant to a hundredth
-_NODE_SIGMA = 0.5  # prior 1-sigma of a log factor: cores and wings of bright stars
-_LEAST_FREEDOM = 0.1  # floor of the freedom of two axes: one star of few keeps none
-
-
-@dataclass(frozen=True)
-class CentroidVariance:
-    """
-    Correction of the centroid covariances C: ``f(magnitude) (scale C + floor_px2 I)``.
-
-    The floor covers errors that a centroid fit cannot see: the real shape of the PSF, the air.
-    The scale corrects a wrong detector gain.  The factor f covers errors that come with
-    brightness, as of saturated cores: linear between ``class_magnitude`` (k,), ascending, with the
-    values ``class_factor`` (k,), and constant outside; 1 where both are empty.
-    """
-
-    scale: float
-    floor_px2: float
-    class_magnitude: tuple[float, ...] = ()
-    class_factor: tuple[float, ...] = ()
-
-    def of(self, covariance_px2: Floats, magnitude: NDArray[np.floating]) -> Floats:
-        """Corrected covariances (n, 3) uu, uv, vv of stars of magnitudes (n,)."""
-        corrected = self.scale * covariance_px2 + self.floor_px2 * np.array([1.0, 0.0, 1.0])
-        return corrected * self.factor(magnitude)[:, None]
-
-    def factor(self, magnitude: NDArray[np.floating]) -> Floats:
-        """Factors (n,) on the variance of stars of magnitudes (n,)."""
-        if not self.class_magnitude:
-            return np.ones(len(magnitude))
-        return np.asarray(np.interp(magnitude, self.class_magnitude, self.class_factor))
-
-
-def estimate_variance(
-    residual_px: Floats,
-    covariance_px2: Floats,
-    magnitude: NDArray[np.floating],
-    used: Mask,
-    freedom: Floats,
-    outlier_sigma: float,
-) -> CentroidVariance:
-    """
-    Scale, floor and factor by brightness that make the covariances those of the residuals.
-
-    Parameters
-    ----------
-    residual_px, covariance_px2, magnitude, used : (n, 2), (n, 3), (n,), (n,) bool
-        The observations that the fit used, with their covariances as measured.
-    freedom : (n,)
-        Degrees of freedom that the fit leaves each of them, of two.
-    outlier_sigma : float
-        Length of a residual beyond which it is an outlier.
-
-    Notes
-    -----
-    Scale and floor maximise the restricted likelihood of the residuals, whose gradient is the sum
-    of ``freedom / 2 (square / freedom - variance) / variance^2`` times the derivatives of the
-    variance: weighted least squares of squares over freedom on the measured variance and one, the
-    weights renewed, with less of a square near that of an outlier (`_part`).
-    """
-    own = 0.5 * (covariance_px2[used, 0] + covariance_px2[used, 2])
-    left = np.maximum(freedom[used], _LEAST_FREEDOM)
-    squared = (residual_px[used] ** 2).sum(axis=1) / left
-    # The median of a squared length of two normal axes is ln 2 of its mean.
-    scale, floor_px2 = max(float(np.median(squared / own)) / math.log(2.0), 1e-12), 0.0
-    for _ in range(MOST_ROUNDS):
-        expected = scale * own + floor_px2
-        weight = 0.5 * left * _part(squared / expected, outlier_sigma) / expected**2
-        scale, floor_px2 = _line(own, squared, weight)
-        step = scale * own + floor_px2 - expected
-        if weight @ step**2 < STEP_SIGMA**2:
-            break
-    ratio = squared / (scale * own + floor_px2)
-    counted = 0.5 * left * _part(ratio, outlier_sigma)
-    nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
-    return CentroidVariance(scale, floor_px2, nodes, factors)
-
-
-def _part(ratio: Floats, outlier_sigma: float) -> Floats:
-    """
-    Return the part of squared residuals over variance (n,) that counts.
-
-    Half at the limit of outliers, 4.5 sigma, all to 4.1 and none from 4.9.
-    One at an edge would count and not count in turns, and the estimate with it.
-    """
-    return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * outlier_sigma**2), 0.0, 1.0))
-
-
-def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
-    """Return scale and floor of ``squared = scale own + floor``, not negative."""
-    weighted = weight * own
-    by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
-    right_own, right_one = float(weighted @ squared), float(weight @ squared)
-    determinant = by_own * by_one - both**2
-    scale, floor_px2 = right_own / by_own, 0.0
-    if determinant > ROUNDING * by_own * by_one:  # not all variances are equal
-        scale = (by_one * right_own - both * right_one) / determinant
-        floor_px2 = (by_own * right_one - both * right_own) / determinant
-    if floor_px2 < 0:
-        scale, floor_px2 = right_own / by_own, 0.0
-    if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
-        scale = float(np.clip(scale, *_SCALE_LIMITS))
-        floor_px2 = max((right_one - scale * both) / by_one, 0.0)
-    return scale, floor_px2
-
-
-def _brightness(
-    ratio: Floats, counted: Floats, magnitude: Floats
-) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """
-    Return magnitudes and factors of a smooth function of brightness.
-
-    Scoring of the exponential likelihood of ``ratio`` (n,), squared residuals over variance, of
-    which each counts as ``counted`` (n,) stars, with a normal prior of the logarithms: few stars,
-    or none that differ, give factors near 1.
-    """
-    nodes = np.unique(np.quantile(magnitude, np.linspace(0.0, 1.0, _NODES)))
-    if len(nodes) < 2:
-        return (), ()
-    place = np.rint((magnitude - nodes[0]) / np.ptp(nodes) * _BINS).astype(np.int64)
-    stars, summed = (np.bincount(place, counted * one) for one in (1.0, ratio))
-    bins = nodes[0] + np.ptp(nodes) / _BINS * np.arange(len(stars))
-    basis = np.stack([np.interp(bins, nodes, row) for row in np.eye(len(nodes))], axis=1)
-    log_factor = np.zeros(len(nodes))
-    prior = np.eye(len(nodes)) / _NODE_SIGMA**2
-    for _ in range(MOST_ROUNDS):
-        scaled = summed * np.exp(-basis @ log_factor)
-        gradient = basis.T @ (scaled - stars) - prior @ log_factor
-        # Observed in place of expected information: monotone for a convex cost.
-        step = np.linalg.solve(
-            (basis * np.maximum(scaled, stars)[:, None]).T @ basis + prior, gradient
-        )
-        log_factor = np.clip(log_factor + step, *np.log(_SCALE_LIMITS))
-        if gradient @ step < STEP_SIGMA**2:
-            break
-    return tuple(nodes.tolist()), tuple(np.exp(log_factor).tolist())
 
 
 @dataclass(frozen=True)
@@ -213,36 +73,6 @@ class Data:
     rates: Rates  # in the frame of the first star tracker
     assumed: Assumptions
     groups: tuple[Groups, ...]
-
-
-@dataclass(frozen=True)
-class Weighting:
-    """Conclusions from the residuals of a round: the weights of the next one."""
-
-    variance: CentroidVariance
-    errors: tuple[SharedError, ...]
-    kept: Mask
-    attitudes: AttitudeErrors | None
-
-    def covariance_px2(self, table: StarTable) -> Floats:
-        """Return the covariances (n, 3) of the observations."""
-        covariance_px2 = self.variance.of(table.covariance_px2, table.magnitude)
-        beyond_px2 = np.broadcast_to(star_shares_px2(self.errors)[1], len(table))
-        return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
-
-    def inflation_px2(self, table: StarTable) -> Floats:
-        """
-        Return the variance (n,) by which the weights are lower for errors that images share.
-
-        With it, k images of a star weigh as the mean of theirs does.
-        """
-        sightings = np.bincount(table.star, self.kept, int(table.star.max()) + 1)[table.star]
-        return np.asarray(np.maximum(sightings - 1.0, 0.0) * star_shares_px2(self.errors)[0])
-
-    def working_px2(self, table: StarTable) -> Floats:
-        """Return the covariances (n, 3) whose inverses are the weights."""
-        inflation_px2 = self.inflation_px2(table)
-        return self.covariance_px2(table) + np.outer(inflation_px2, [1.0, 0.0, 1.0])
 
 
 def weighted_attitudes(
@@ -388,7 +218,6 @@ def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Float
 
 def judge(
     data: Data,
-    from_sky: Floats,
     residual_px: Floats,
     freedom: Floats,
     before: Weighting,
@@ -433,6 +262,6 @@ def judge(
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
         errors = shared_errors(
-            residual_px, own_px2, kept, data.groups, from_sky, found.last_octave
+            residual_px, own_px2, kept, data.groups, before.from_sky, found.last_octave
         )
-    return Weighting(variance, errors, kept, attitudes)
+    return Weighting(table, before.from_sky, variance, errors, kept, attitudes)

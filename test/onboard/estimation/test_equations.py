@@ -16,13 +16,12 @@ import pytest
 
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation.equations import (
-    Equations,
     equations,
     information_of_images,
     star_sums,
     stars_alone,
 )
-from starcal_ros.estimation.levenberg_marquardt import NotObservable
+from starcal_ros.estimation.levenberg_marquardt import Equations, NotObservable
 from starcal_ros.estimation.unknowns import unknowns_in_state
 
 # Finite differences leave 1e-10 of a derivative, and attitude errors of 20 arcsec, which enter the

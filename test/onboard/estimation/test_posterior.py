@@ -27,13 +27,14 @@ from scipy.linalg import null_space
 
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation.amplitudes import LARGEST_FIELD_PX, log_amplitudes
+from starcal_ros.estimation.centroid_variance import CentroidVariance
 from starcal_ros.estimation.posterior import (
     common_shape,
     Posterior,
     posterior,
     TRACKER_NOISE,
     TRACKER_SLOW,
-    Weights,
+    Weighting,
     with_shared_errors,
 )
 from starcal_ros.estimation.shared_errors import SharedError
@@ -202,7 +203,25 @@ def test_shapes_have_the_likelihood_of_contrasts_free_of_everything_else(varied:
             assert log_likelihood(near_px) < log_likelihood(best_px) + 0.3
 
 
-def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict[str, Floats]]:
+@dataclass(frozen=True)
+class Shared:
+    """Errors that observations and attitudes share."""
+
+    weights: Weighting
+    trackers: tuple[TrackerErrors, ...]
+
+
+def weighted(
+    given: Small, from_sky: Floats, variance_px2: Floats, *errors: SharedError
+) -> Weighting:
+    """Weights of observations of these variances (n,) per axis."""
+    table = dataclasses.replace(
+        given.table, covariance_px2=np.outer(variance_px2, [1.0, 0.0, 1.0])
+    )
+    return Weighting(table, from_sky, CentroidVariance(1.0, 0.0), errors, given.keep, None)
+
+
+def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[str, Floats]]:
     """
     Random shared errors, and their dense covariances (2 n, 2 n) by name.
 
@@ -221,8 +240,9 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
         SharedError('cells', cells, np.full(n, cell_px**2), 0.0, False, 1.0),
         SharedError('rows', rng.integers(0, 5, n), np.full(n, 0.5), 0.0, False, 0.0),
     )
-    inflation = rng.uniform(0.0, 0.5, n)
+    # Some observations have less variance than they share, and some more.
     variance = (place_px**2 + cell_px**2) * rng.uniform(0.5, 2.0, n)
+    weights = weighted(given, from_sky, variance, *errors)
     trackers = []
     for rows, group in (
         (np.array([0, 2]), np.array([0, 1])),
@@ -238,25 +258,29 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Weights, dict
     share = np.sqrt(np.minimum(variance / total, 1.0))
     V = {name: np.zeros((n, 2, n, 2)) for name in ('star places', 'cells', 'independent')}
     for i in np.flatnonzero(used):
-        V['independent'][i, :, i] = -(inflation[i] + share[i] ** 2 * total[i]) * np.eye(2)
+        V['independent'][i, :, i] = -(
+            weights.inflation_px2[i] + share[i] ** 2 * total[i]
+        ) * np.eye(2)
         for j in np.flatnonzero(used):
             common = share[i] * share[j] * np.eye(2)
             if star[i] == star[j] and several[i]:
                 V['star places'][i, :, j] = place_px**2 * common @ from_sky[i] @ from_sky[j].T
             if cells[i] == cells[j]:
                 V['cells'][i, :, j] = cell_px**2 * common
-    weights = Weights(variance, inflation, from_sky, errors, tuple(trackers))
-    return weights, {name: one.reshape(2 * n, 2 * n) for name, one in V.items()}
+    return Shared(weights, tuple(trackers)), {
+        name: one.reshape(2 * n, 2 * n) for name, one in V.items()
+    }
 
 
 def widened(
-    given: Small, found: Posterior, weights: Weights, negligible: float = 1e-13
+    given: Small, found: Posterior, errors: Shared, negligible: float = 1e-13
 ) -> Posterior:
-    return with_shared_errors(found, given.sums(), given.linear(), weights, negligible)
+    shared_by = errors.weights, errors.trackers
+    return with_shared_errors(found, given.sums(), given.linear(), *shared_by, negligible)
 
 
 def propagated(
-    given: Small, truth: Dense, gain: Floats, weights: Weights, V: dict[str, Floats]
+    given: Small, truth: Dense, gain: Floats, errors: Shared, V: dict[str, Floats]
 ) -> dict[str, Floats]:
     """``A V A'`` of each error; the gain A is by the whitened observations and attitudes."""
     white = whitener(given.table.covariance_px2)
@@ -264,7 +288,7 @@ def propagated(
     A = gain[:, :count] @ white
     parts = {name: A @ one @ A.T for name, one in V.items()}
     noise, slow, working = np.zeros((3, len(gain), len(gain)))
-    for one in weights.trackers:
+    for one in errors.trackers:
         of_groups = one.covariance - one.independent * np.eye(len(one.covariance))
         for axis in one.axes:
             B = gain[:, count + 3 * one.images + axis]
@@ -280,9 +304,9 @@ def test_shared_errors_widen_lines_of_sight_as_the_dense_covariance() -> None:
     given = small(2, field_px=0.2)
     truth = dense(given)
     # Far larger than centroid errors, which are mostly hidden by the field of 150 coefficients.
-    weights, V = shared(given, 2.0, 1.5)
+    errors, V = shared(given, 2.0, 1.5)
     found = solved(given)
-    after = widened(given, found, weights)
+    after = widened(given, found, errors)
     assert np.array_equal(after.mean, found.mean)
     P = given.layout.count
     # The gain of the averaged estimator: its covariance times what the images leave of X.
@@ -292,7 +316,7 @@ def test_shared_errors_widen_lines_of_sight_as_the_dense_covariance() -> None:
     N += np.diag(prior_precision(given, found.shapes.sigma_px, None)[own])
     left = X[:, :P] - X[:, own] @ np.linalg.solve(N, X[:, own].T @ X[:, :P])
     plain = found.covariance - common_shape(given.layout, found.shapes.common_px2)
-    parts = propagated(given, truth, plain @ left.T, weights, V)
+    parts = propagated(given, truth, plain @ left.T, errors, V)
     rows = truth.stars[::7, :P]
 
     def seen_by(covariance: Floats) -> Floats:
@@ -305,10 +329,10 @@ def test_shared_errors_widen_lines_of_sight_as_the_dense_covariance() -> None:
     assert np.abs(seen_by(after.covariance)[seen] / expected[seen] - 1.0).max() < 0.03
     assert np.abs(expected[seen] / before[seen] - 1.0).max() > 0.1
     del parts['independent']
-    errors = after.errors
-    assert errors is not None and set(errors.shared) == set(parts)
-    for name, one in errors.shared.items():
-        off = seen_by(errors.root @ one @ errors.root.T) - seen_by(parts[name])
+    widening = after.errors
+    assert widening is not None and set(widening.shared) == set(parts)
+    for name, one in widening.shared.items():
+        off = seen_by(widening.root @ one @ widening.root.T) - seen_by(parts[name])
         assert np.abs(off[seen] / expected[seen]).max() < 0.03, name
     field = given.layout.places['field']
     of_field = np.einsum(
@@ -325,15 +349,10 @@ def _exact(given: Small, covariance: Floats) -> TrackerErrors:
 
 def test_independent_errors_of_the_working_weights_change_nothing(given: Small) -> None:
     n = len(given.table)
-    weights = Weights(
-        np.ones(n),
-        np.zeros(n),
-        np.tile(np.eye(2), (n, 1, 1)),
-        (SharedError('alone', np.arange(n), np.ones(n), 0.0, False, 1.0),),
-        (_exact(given, np.eye(IMAGES)),),
-    )
+    alone = SharedError('alone', np.arange(n), np.ones(n), 0.0, False, 1.0)
+    weights = weighted(given, np.tile(np.eye(2), (n, 1, 1)), np.ones(n), alone)
     found = solved(given)
-    after = widened(given, found, weights)
+    after = widened(given, found, Shared(weights, (_exact(given, np.eye(IMAGES)),)))
     sigma = np.sqrt(np.diag(found.covariance).clip(1e-300))
     free = found.estimated
     off = (after.covariance - found.covariance) / np.outer(sigma, sigma)
@@ -345,15 +364,9 @@ def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -
     plain = small(6, terms=False, two_trackers=False)
     n = len(plain.table)
     shared_all = 50.0 * np.ones((IMAGES, IMAGES)) + np.eye(IMAGES)
-    weights = Weights(
-        np.ones(n),
-        np.zeros(n),
-        np.tile(np.eye(2), (n, 1, 1)),
-        (),
-        (_exact(plain, shared_all),),
-    )
+    weights = weighted(plain, np.tile(np.eye(2), (n, 1, 1)), np.ones(n))
     found = solved(plain)
-    after = widened(plain, found, weights)
+    after = widened(plain, found, Shared(weights, (_exact(plain, shared_all),)))
     added = after.covariance - found.covariance
     at = plain.layout.of(['alignment'])
     # Its axes are those of the star tracker: turned into the camera frame.

@@ -113,7 +113,7 @@ def test_what_is_not_assumed_or_not_known_is_no_unknown() -> None:
     def layout_of(rates_rad_s: Floats, assumed: Assumptions) -> Layout:
         root = (1e-3 if np.isnan(rates_rad_s).all() else 0.0) * np.eye(3)
         rates = Rates(rates_rad_s, np.tile(root, (IMAGES, 1, 1)), TURN_S)
-        return unknowns_of(given.problem, given.state, rates, size, assumed)
+        return unknowns_of(EntryInputs(given.problem, given.state, rates, size, assumed))
 
     still, unknown = np.zeros((IMAGES, 3)), np.full((IMAGES, 3), np.nan)
     one = still.copy()

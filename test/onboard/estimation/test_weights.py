@@ -10,19 +10,18 @@ import pytest
 from scipy.optimize import minimize
 
 from starcal_ros.arrays import Floats
+from starcal_ros.estimation.centroid_variance import (
+    _brightness,
+    CentroidVariance,
+    estimate_variance,
+)
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.options import CalibrationOptions
+from starcal_ros.estimation.posterior import Weighting
 from starcal_ros.estimation.shared_errors import observation_groups
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions
-from starcal_ros.estimation.weights import (
-    _brightness,
-    CentroidVariance,
-    Data,
-    estimate_variance,
-    judge,
-    Weighting,
-)
+from starcal_ros.estimation.weights import Data, judge
 from starcal_ros.records import CameraGeometry
 
 N = 6000
@@ -237,8 +236,9 @@ def test_residuals_that_no_star_is_left_of_say_so(off_px: float, words: str) -> 
         Assumptions(0.0, (0.0, 0.0), 0.0),
         observation_groups(table.measured_px, table.star, CAMERA.width),
     )
-    before = Weighting(CentroidVariance(1.0, 0.0), (), np.ones(n, bool), None)
     from_sky = np.tile(np.eye(2), (n, 1, 1))
+    variance = CentroidVariance(1.0, 0.0)
+    before = Weighting(table, from_sky, variance, (), np.ones(n, bool), None)
     off = off_px * np.random.default_rng(1).normal(size=(n, 2))
     with pytest.raises(NotObservable, match=words):
-        judge(data, from_sky, off, np.full(n, 2.0), before, None)
+        judge(data, off, np.full(n, 2.0), before, None)

@@ -53,7 +53,9 @@ def test_normalised_errors_are_chi_squared() -> None:
     assert not any(one.misfit_image.any() for one in found)
     # One in 25,000 sound stars is beyond 4.5 sigma.
     assert sum(int((~one.kept).sum()) for one in found) < 15
-    scales = [one.variance.of(one.table.covariance_px2, one.table.magnitude) for one in found]
+    scales = [
+        one.weights.variance.of(one.table.covariance_px2, one.table.magnitude) for one in found
+    ]
     given = [one.table.covariance_px2 for one in found]
     ratio = np.concatenate(scales)[:, 0] / np.concatenate(given)[:, 0]
     assert np.mean(ratio) == pytest.approx(1.0, abs=0.05)
