@@ -19,15 +19,9 @@ from scipy.spatial.transform import Rotation
 from scipy.special import pdtrc
 
 from starcal_ros.arrays import Floats, Mask, Pixels
-from starcal_ros.camera import (
-    CameraModel,
-    field_radius_rad,
-    project,
-    project_jacobians,
-    rotation_jacobian,
-)
+from starcal_ros.camera import CameraModel, project, project_jacobians, rotation_jacobian
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.prediction import Prediction, visible
+from starcal_ros.identification.prediction import predict, Prediction
 from starcal_ros.identification.star_finder import (
     Exposure,
     measure_predicted,
@@ -36,7 +30,6 @@ from starcal_ros.identification.star_finder import (
 )
 from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median
-from starcal_ros.sky.catalog import cone
 from starcal_ros.stars import detection
 from starcal_ros.stars.image_model import Instrument, known_model
 
@@ -56,14 +49,13 @@ _SMALL_SIGMA = 1e-3  # 1-sigma of the other coefficients: decentring, thin prism
 @dataclass(frozen=True)
 class TrackedCamera:
     """
-    State of a track: geometry, field radius and PSF from the images so far.
+    State of a track: geometry and PSF from the images so far.
 
     ``geometry`` predicts the next image; its camera may differ from the prior of the calibration,
     because it only has to predict the windows.
     """
 
     geometry: CameraGeometry
-    field_radius_rad: float
     instrument: Instrument
 
 
@@ -77,8 +69,7 @@ def start_tracking(
     """
     if observations.refusal or instrument is None:
         return None
-    corrected = _corrected(geometry, observations)
-    return TrackedCamera(corrected, field_radius_rad(corrected.camera), instrument)
+    return TrackedCamera(_corrected(geometry, observations), instrument)
 
 
 def track_stars(
@@ -91,20 +82,27 @@ def track_stars(
     ``smeared``.
     """
     pixels = exposure.image.pixels
-    prediction = _predict(exposure, before, search)
+    camera = before.geometry.camera
+    prediction = predict(
+        before.geometry,
+        exposure.icrf_from_star_tracker_xyzw,
+        exposure.image.time_ns,
+        search.catalog,
+        search.identification.magnitude_limit,
+        SEARCH_RADIUS_PX / float(camera.parameters[0]),
+        exposure.velocity.m_s,
+        exposure.site,
+    )
     # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
     background = (
         detection.sample_background(pixels) if fitted else detection.measure_background(pixels)
     )
-    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera)
+    rotation_rad = _find_rotation(pixels, background, prediction, camera)
     rotation = Rotation.from_rotvec(-rotation_rad)
     direction_camera = rotation.apply(prediction.direction_camera)
-    prediction = dataclasses.replace(
-        prediction,
-        direction_camera=direction_camera,
-        xy_px=project(before.geometry.camera, direction_camera),
-    )
+    xy_px = project(camera, direction_camera)
+    prediction = dataclasses.replace(prediction, direction_camera=direction_camera, xy_px=xy_px)
     model = known_model(pixels, background, before.instrument, prediction.xy_px, search.centroid)
     observations, instrument = measure_predicted(
         exposure, prediction, model, before.instrument, search
@@ -115,29 +113,7 @@ def track_stars(
     rotation_px = rotation.magnitude() * prediction.px_per_rad
     if rotation_px < _STEADY_PX and _fits(before.geometry, rotation, observations):
         return observations, dataclasses.replace(before, instrument=instrument)
-    corrected = _corrected(before.geometry, observations)
-    radius_rad = before.field_radius_rad
-    if corrected.camera is not before.geometry.camera:
-        radius_rad = field_radius_rad(corrected.camera)
-    return observations, TrackedCamera(corrected, radius_rad, instrument)
-
-
-def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> Prediction:
-    """Apparent catalog stars in the field, brightest first."""
-    camera = before.geometry.camera
-    attitude = before.geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
-    icrf_from_camera = attitude.as_matrix()
-    # The catalog, and so the rows of a cone, are sorted by magnitude.
-    catalog, limit = search.catalog, search.identification.magnitude_limit
-    index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
-    index, direction_icrf = visible(
-        catalog, index, exposure.image.time_ns, exposure.velocity.m_s, exposure.site
-    )
-    direction_camera = direction_icrf @ icrf_from_camera
-    # Outside the field the distortion polynomial may fold back into the image.
-    near = direction_camera[:, 2] > np.cos(before.field_radius_rad + 2e-3)
-    xy_px = project(camera, direction_camera)
-    return Prediction(index, direction_icrf, direction_camera, xy_px, camera).select(near)
+    return observations, TrackedCamera(_corrected(before.geometry, observations), instrument)
 
 
 def _find_rotation(
