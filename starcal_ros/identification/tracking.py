@@ -18,7 +18,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import pdtrc
 
-from starcal_ros.arrays import Floats, Mask, Pixels
+from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, project, project_jacobians, rotation_jacobian
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.prediction import predict, Prediction
@@ -37,7 +37,6 @@ _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
 _MAX_P_VALUE = 1e-9  # p-value of the matches in the windows, given a wrong prediction
 _GOOD_SNR = 10.0  # smallest signal-to-noise ratio of stars that correct the prediction
-_STEADY_PX = 1.0  # smaller rotations are left to the search in the next image
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
 # 1-sigma of the predicting camera about the one before: intrinsics as parts of the focal length,
 # and distortion for a lens with an inaccurate prior.
@@ -109,11 +108,8 @@ def track_stars(
     )
     if observations.refusal:
         raise ImageRefused(observations.refusal, observations.detail)
-    instrument = instrument or before.instrument
-    rotation_px = rotation.magnitude() * prediction.px_per_rad
-    if rotation_px < _STEADY_PX and _fits(before.geometry, rotation, observations):
-        return observations, dataclasses.replace(before, instrument=instrument)
-    return observations, TrackedCamera(_corrected(before.geometry, observations), instrument)
+    corrected = _corrected(before.geometry, observations)
+    return observations, TrackedCamera(corrected, instrument or before.instrument)
 
 
 def _find_rotation(
@@ -162,23 +158,14 @@ def _find_rotation(
     return np.asarray(rotation_rad)
 
 
-def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObservations) -> bool:
-    """Return True if the rotated camera predicts the stars within the systematic limit."""
-    bright = _bright(observations)
-    attitude = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
-    camera_from_icrf = rotation * attitude.inv()
-    directions = observations.direction_icrf[bright] @ camera_from_icrf.as_matrix().T
-    off_px = observations.measured_px[bright] - project(geometry.camera, directions)
-    return _rms_px(off_px) < _SYSTEMATIC_PX
-
-
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """Geometry aligned to the stars of an image; its camera is corrected if it does not fit."""
     camera = geometry.camera
     icrf_from_camera = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
-    bright = _bright(observations)
+    bright = observations.snr > _GOOD_SNR
+    bright |= np.count_nonzero(bright) < 4
     directions, measured_px = directions[bright], observations.measured_px[bright]
     # A prediction need not be better than 0.05 px.
     weight = 1.0 / (variance_px2[bright] + 0.05**2)
@@ -192,12 +179,6 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
     camera_from_star_tracker = rotation * icrf_from_camera.inv() * icrf_from_star_tracker
     return CameraGeometry(camera, camera_from_star_tracker.inv().as_quat())
-
-
-def _bright(observations: StarObservations) -> Mask:
-    """Mask (n,) of the stars that correct a prediction; all if too few are bright."""
-    bright = observations.snr > _GOOD_SNR
-    return np.asarray(bright | (np.count_nonzero(bright) < 4))
 
 
 def _rms_px(off_px: Floats) -> float:
