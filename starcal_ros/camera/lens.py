@@ -49,9 +49,14 @@ class LensModel:
     ----------
     coefficients : tuple of str
         Names, in order; the functions take the numbers as (c,), or (c, n) for n points.
-    distort, by_ideal, by_coefficients, fold_radius2 : callable
-        As the functions `distort`, `distort_jacobian`, `coefficient_jacobian` and `fold_radius2`
-        of this module, without the name of the model.
+    distort : callable
+        Distorted points (..., 2) of ideal points (..., 2) and coefficients (Eq. 6 for
+        ``plumb_bob``); NaN where ``tilted`` would look at the detector from behind.
+    by_ideal, by_coefficients : callable
+        Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37), and (2, c, ...) by
+        the c coefficients, of the same arguments.
+    fold_radius2 : callable
+        As the function of this module, of each coefficient as a number.
     is_angular : bool
         The ideal plane has the angle from the optical axis in place of its tangent.
     is_redundant : bool
@@ -174,25 +179,6 @@ def _bend(r2: Floats) -> Floats:
     return np.where(near, series, (1.0 - far / np.tan(far)) / far2)
 
 
-def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """
-    Distorted points (..., 2) of ideal ones (..., 2) (Eq. 6 for ``plumb_bob``).
-
-    NaN where ``tilted`` would look at the detector from behind.
-    """
-    return LENSES[model].distort(ideal, coefficients)
-
-
-def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37)."""
-    return LENSES[model].by_ideal(ideal, coefficients)
-
-
-def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """Derivatives (2, c, ...) of `distort` at ideal points (..., 2) by the c coefficients."""
-    return LENSES[model].by_coefficients(ideal, coefficients)
-
-
 def fold_radius2(model: str, coefficients: Floats) -> float:
     """
     Squared radius of the ideal plane from which the radial distortion has no inverse.
@@ -255,7 +241,7 @@ class _OpenCv:
             J[..., 0, :] += 2 * (s1 + 2 * s2 * r2)[..., None] * ideal
             J[..., 1, :] += 2 * (s3 + 2 * s4 * r2)[..., None] * ideal
         if self.has_tilt:
-            xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+            xd, yd = np.moveaxis(LENSES['thin_prism'].distort(ideal, coefficients[:12]), -1, 0)
             J = _tilt_jacobian(xd, yd, *coefficients[12:]) @ J
         return J
 
@@ -345,7 +331,7 @@ def _by_powers(J: Floats, x: Floats, y: Floats, r2: Floats) -> None:
 def _by_tilt(J: Floats, ideal: Floats, coefficients: Floats) -> None:
     """Derivatives (2, 14, ...) by the angles of the detector into J, the others through them."""
     tau_x, tau_y = coefficients[12:]
-    xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+    xd, yd = np.moveaxis(LENSES['thin_prism'].distort(ideal, coefficients[:12]), -1, 0)
     J[:, :12] = np.einsum('...ij,jk...->ik...', _tilt_jacobian(xd, yd, tau_x, tau_y), J[:, :12])
     sx, cx, sy, cy = np.sin(tau_x), np.cos(tau_x), np.sin(tau_y), np.cos(tau_y)
     xt, yt, w = _tilt(xd, yd, tau_x, tau_y)

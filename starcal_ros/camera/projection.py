@@ -6,7 +6,7 @@ The parameters are one vector, in this order everywhere::
 
     fx skew fy cx cy  then the coefficients of the lens model (`lens.LENSES`)
 
-With (x', y') the distorted point of the image plane (`lens.distort`)::
+With (x', y') the distorted point of the image plane (`lens.LensModel`)::
 
     u = fx x' + skew y' + cx
     v = fy y' + cy
@@ -226,7 +226,7 @@ def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
-    distorted = lens.distort(camera.model, _plane_points(camera, pixels), camera.distortion)
+    distorted = camera.lens.distort(_plane_points(camera, pixels), camera.distortion)
     return _pixels(camera.intrinsics, distorted) - pixels
 
 
@@ -252,8 +252,8 @@ def project_parameters(model: str, parameters: Floats, directions_camera: Floats
     is given a direction at or behind the plane of the lens (Z <= 0).  Complex parameters or
     directions pass through, for complex-step derivatives.
     """
-    distorted = lens.distort(model, lens.ideal_points(model, directions_camera), parameters[5:])
-    return _pixels(parameters[:5], distorted)
+    ideal = lens.ideal_points(model, directions_camera)
+    return _pixels(parameters[:5], lens.LENSES[model].distort(ideal, parameters[5:]))
 
 
 def project(camera: CameraModel, directions_camera: Floats) -> Floats:
@@ -303,7 +303,7 @@ def project_jacobians(
     """
     xy = _ideal_in_front(camera.model, directions_camera)
     fx, skew, fy, _, _ = camera.intrinsics
-    distorted = lens.distort(camera.model, xy, camera.distortion)
+    distorted = camera.lens.distort(xy, camera.distortion)
     xd, yd = distorted[..., 0], distorted[..., 1]
 
     J_parameters = np.zeros((*xd.shape, 2, len(camera.parameters)))
@@ -312,7 +312,7 @@ def project_jacobians(
     J_parameters[..., 0, 3] = 1.0
     J_parameters[..., 1, 2] = yd
     J_parameters[..., 1, 4] = 1.0
-    columns = lens.coefficient_jacobian(camera.model, xy, camera.distortion)
+    columns = camera.lens.by_coefficients(xy, camera.distortion)
     for k, (column_x, column_y) in enumerate(zip(*columns, strict=True), start=5):
         J_parameters[..., 0, k] = fx * column_x + skew * column_y
         J_parameters[..., 1, k] = fy * column_y
@@ -329,7 +329,7 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
     """
     xy = _ideal_in_front(camera.model, directions_camera)
     fx, skew, fy, _, _ = camera.intrinsics
-    J_xy = lens.distort_jacobian(camera.model, xy, camera.distortion)
+    J_xy = camera.lens.by_ideal(xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
     J_v = fy * J_xy[..., 1, :]
     x_theta, y_theta = lens.ideal_by_rotation(camera.model, xy)
@@ -355,8 +355,8 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     Newton iteration on the distortion with its analytic Jacobian.  NaN beyond the fold of the
     model, where it has no inverse on the branch of the optical axis.
     """
-    model, distortion = camera.model, camera.distortion
-    fold2 = lens.fold_radius2(model, distortion)
+    distortion = camera.distortion
+    fold2 = lens.fold_radius2(camera.model, distortion)
     pixels = np.asarray(pixels, np.float64)
     if (field := camera.moving_field) is not None:
         pixels = pixels - field.displacement_px(pixels)
@@ -366,10 +366,10 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
     error = np.full(target.shape, np.inf)
     for _ in range(_INVERSE_STEPS):
-        error = lens.distort(model, xy, distortion) - target
+        error = camera.lens.distort(xy, distortion) - target
         if np.abs(error).max(initial=0.0) < _INVERSE_TOLERANCE:
             break
-        J = lens.distort_jacobian(model, xy, distortion)
+        J = camera.lens.by_ideal(xy, distortion)
         with np.errstate(all='ignore'):
             by_y, by_x = error[..., 1], error[..., 0]
             step = lens.points_of(
@@ -384,12 +384,12 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
                 step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
                 step[np.isnan(step)] = 0.0
         xy = _inside(xy, xy - step, fold2) if guarded else xy - step
-    determinant = _determinant(lens.distort_jacobian(model, xy, distortion))
+    determinant = _determinant(camera.lens.by_ideal(xy, distortion))
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
     xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
-    return lens.directions_of(model, xy)
+    return lens.directions_of(camera.model, xy)
 
 
 def _determinant(J: Floats) -> Floats:
