@@ -55,6 +55,7 @@ _SHORT = 0.3  # a step that stays on the branch, on the ideal image plane
 _INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal length of 4000 px
 # Penalty of a fit for each unit by which a coefficient of a rational polynomial changes.
 _HELD_PX = 1e-2
+_EXACT_PX = 1e-9  # beyond the rounding of a projection and its inverse
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -128,12 +129,8 @@ class CameraModel(Record):
     @property
     def moving_field(self) -> DetectorField | None:
         """The field if it moves pixels, else None: a field of zeros only carries a covariance."""
-        return self.field if self.has_field else None
-
-    @property
-    def has_field(self) -> bool:
-        """True where a field moves pixels."""
-        return self.field is not None and bool(self.field.coefficients.any())
+        moves = self.field is not None and self.field.coefficients.any()
+        return self.field if moves else None
 
     @property
     def camera_matrix(self) -> Floats:
@@ -147,9 +144,14 @@ class CameraModel(Record):
         return {}
 
     @functools.cached_property
-    def _ros_fit(self) -> tuple[CameraModel, float]:
-        """Result of `ros_fit`, for which the budget and ``camera_info`` of a calibration ask."""
-        return nearest_camera(self, self.model, ('skew',))
+    def ros_fit(self) -> tuple[CameraModel, float]:
+        """
+        Best camera without skew and field, for readers of ``camera_info``, its worst error, px.
+
+        They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is
+        a rotation, which only the alignment could take up, so some error stays.
+        """
+        return convert(self, self.model, ('skew',))
 
     @property
     def opencv_coefficients(self) -> Floats:
@@ -440,20 +442,13 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     return camera._field_radii_rad.setdefault(margin_px, radius_rad)
 
 
-def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
-    """
-    Best camera without skew and field, for readers of ``camera_info``, and its worst error, px.
-
-    They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is a
-    rotation, which only the alignment could take up, so some error stays.
-    """
-    return camera._ros_fit
-
-
-def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
+def convert(
+    camera: CameraModel, model: str, zero: tuple[str, ...] = ()
+) -> tuple[CameraModel, float]:
     """
     Best camera of a lens model for the lines of sight of another camera, and its worst error.
 
+    It has no field, and the parameters of the names ``zero`` are zero, for formats without them.
     Least squares over a 25 x 25 grid of the detector, starting with the coefficients that both
     models have.  Raises ValueError for an unknown model.
 
@@ -464,36 +459,14 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
         Largest pixel error over the grid; infinite where the model cannot see all of it, or no
         camera of the model is found.
     """
-    if camera.has_lens(model) and not camera.has_field:
-        return dataclasses.replace(camera, field=None), 0.0
     is_angular = lens.lens_named(model).is_angular
     names = parameter_names(model)
-    known = dict(zip(camera.parameter_names, camera.parameters, strict=True))
-    same_plane = not (is_angular or camera.lens.is_angular)
-    start = np.array([known.get(name, 0.0) for name in names])
-    if not same_plane:
-        start[5:] = 0.0
-    started = CameraModel(camera.width, camera.height, start, model)
-    if same_plane and known.keys() <= set(names) and not camera.has_field:
-        return started, 0.0  # a special case of the larger model
-    return _fit(started, list(range(len(names))), camera)
-
-
-def nearest_camera(
-    camera: CameraModel, model: str, zero: tuple[str, ...]
-) -> tuple[CameraModel, float]:
-    """
-    As `convert`, without field and with some parameters held at zero, for formats without them.
-
-    Raises ValueError for an unknown model, or a name that is not one of its parameters.
-    """
-    start = camera if camera.has_lens(model) else convert(camera, model)[0]
-    start = dataclasses.replace(start.replace(**dict.fromkeys(zero, 0.0)), field=None)
-    unchanged = not camera.has_field and camera.has_lens(model)
-    if unchanged and np.array_equal(start.parameters, camera.parameters):
-        return start, 0.0
-    free = [k for k, name in enumerate(start.parameter_names) if name not in zero]
-    return _fit(start, free, camera)
+    same_plane = camera.has_lens(model) or not (is_angular or camera.lens.is_angular)
+    shared = camera.parameter_names if same_plane else INTRINSIC_NAMES
+    known = dict(zip(shared, camera.parameters, strict=False))
+    values = [0.0 if name in zero else known.get(name, 0.0) for name in names]
+    started = CameraModel(camera.width, camera.height, np.array(values), model)
+    return _fit(started, [k for k, name in enumerate(names) if name not in zero], camera)
 
 
 def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[CameraModel, float]:
@@ -502,7 +475,16 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     directions = line_of_sight(camera, target)
     exists = np.isfinite(directions[:, 0])
     target, directions = target[exists], directions[exists]
-    visible = np.isfinite(project(start, directions)).all(axis=1)
+
+    def error_px(fitted: CameraModel) -> Floats:
+        error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
+        return np.where(np.isnan(error), np.inf, error)
+
+    start_error_px = error_px(start)
+    # The same lens, or a special case of a larger model.
+    if (start_error_px < _EXACT_PX).all():
+        return start, 0.0
+    visible = np.isfinite(start_error_px)
 
     def moved(x: Floats) -> CameraModel:
         parameters = start.parameters.copy()
@@ -541,5 +523,4 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         fitted = moved(solution.x)
     except ValueError:  # a step to a camera that cannot be, or to no number
         return start, math.inf
-    error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
-    return fitted, float(np.where(np.isnan(error), np.inf, error).max(initial=0.0))
+    return fitted, float(error_px(fitted).max(initial=0.0))
