@@ -38,7 +38,7 @@ _FLOOR_PX = 0.05  # systematic error of star positions, per axis
 
 
 def find_line_loss(
-    predicted_px: Floats, measured_px: Floats, sigma_px: Floats, shape: tuple[int, int]
+    predicted_px: Floats, measured_px: Floats, sigma_px: Floats, shape: tuple[int, ...]
 ) -> tuple[int, Floats] | None:
     """
     First row after lost lines, about, and the offset (2,) of those below, px; None without a jump.
@@ -165,8 +165,7 @@ def _alone_in_part(
     gone = seen & ((refusal == StarRefusal.NOT_DETECTED) | (refusal == StarRefusal.AMBIGUOUS))
     if np.count_nonzero(gone) < _FEWEST - 1:
         return np.zeros_like(kept)
-    height, width = shape
-    part = part_of(predicted_px, width, height)
+    part = part_of(predicted_px, shape)
     found = np.bincount(part[seen & kept], minlength=PARTS)
     shown = found + np.bincount(part[gone], minlength=PARTS)
     if not missed_parts(shown, found).any():

@@ -76,7 +76,7 @@ def predict(
     with np.errstate(invalid='ignore'):
         # Far outside the image the distortion polynomial folds over: keep only the stars whose
         # pixel maps back to their direction.
-        near = in_image(xy_px, camera.width, camera.height, margin_px)
+        near = in_image(xy_px, camera, margin_px)
     near[near] &= np.einsum(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
     ) > np.cos(1e-6)
@@ -130,20 +130,15 @@ def visible(
     return index[high], direction_icrf[high]
 
 
-def in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> Mask:
+def in_image(xy_px: Floats, camera: CameraModel, margin_px: float = 0.0) -> Mask:
     """Mask (n,) of the pixels (n, 2) inside the image widened by a margin."""
     u, v, m = xy_px[:, 0], xy_px[:, 1], margin_px
-    return (u > -m) & (u < width - 1 + m) & (v > -m) & (v < height - 1 + m)
+    return (u > -m) & (u < camera.width - 1 + m) & (v > -m) & (v < camera.height - 1 + m)
 
 
 def window_area(camera: CameraModel, margin_px: float) -> float:
     """Area of the image widened by a margin, in areas of the image."""
     return (1.0 + 2.0 * margin_px / camera.width) * (1.0 + 2.0 * margin_px / camera.height)
-
-
-def within_image(prediction: Prediction, width: int, height: int) -> Prediction:
-    """Predicted stars inside the image."""
-    return prediction.select(in_image(prediction.xy_px, width, height))
 
 
 def warp_powers(n: int) -> list[tuple[int, int]]:

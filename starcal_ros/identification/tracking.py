@@ -21,10 +21,11 @@ from scipy.special import pdtrc
 from starcal_ros.arrays import Floats, Pixels
 from starcal_ros.camera import CameraModel, project, project_jacobians, rotation_jacobian
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.prediction import predict, Prediction
+from starcal_ros.identification.prediction import Prediction
 from starcal_ros.identification.star_finder import (
     Exposure,
     measure_predicted,
+    predicted,
     SEARCH_RADIUS_PX,
     StarSearch,
 )
@@ -82,16 +83,8 @@ def track_stars(
     """
     pixels = exposure.image.pixels
     camera = before.geometry.camera
-    prediction = predict(
-        before.geometry,
-        exposure.icrf_from_star_tracker_xyzw,
-        exposure.image.time_ns,
-        search.catalog,
-        search.identification.magnitude_limit,
-        SEARCH_RADIUS_PX / float(camera.parameters[0]),
-        exposure.velocity.m_s,
-        exposure.site,
-    )
+    margin_rad = SEARCH_RADIUS_PX / float(camera.parameters[0])
+    prediction = predicted(exposure, before.geometry, search, margin_rad)
     # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
     background = (

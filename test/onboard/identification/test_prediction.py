@@ -13,7 +13,6 @@ from starcal_ros.identification.prediction import (
     predict,
     Prediction,
     warp_powers,
-    within_image,
 )
 from starcal_ros.sky.catalog import load_catalog
 
@@ -44,12 +43,11 @@ def test_stars_beyond_magnitude_and_margin_are_left_out() -> None:
     np.testing.assert_array_equal(
         few.catalog_index, wide.catalog_index[CATALOG.magnitude[wide.catalog_index] <= 7.0]
     )
-    width, height = SCENARIO.truth.camera.width, SCENARIO.truth.camera.height
-    outside = ~in_image(wide.xy_px, width, height)
+    outside = ~in_image(wide.xy_px, wide.camera)
     assert 0 < np.count_nonzero(outside) < len(outside)
     exact = predicted(one)
     np.testing.assert_array_equal(exact.catalog_index, wide.catalog_index[~outside])
-    shown = within_image(wide, width, height)
+    shown = wide.select(~outside)
     for column in ('catalog_index', 'direction_icrf', 'direction_camera', 'xy_px'):
         np.testing.assert_array_equal(getattr(shown, column), getattr(exact, column))
     assert shown.px_per_rad == exact.px_per_rad == SCENARIO.truth.camera.parameters[0]
