@@ -30,7 +30,7 @@ from starcal_ros.stars.image_model import (
     Instrument,
     MAX_SHAPE_CHANGE,
     PsfWidth,
-    SHOWN_SNR,
+    showing_psf,
     width_basis,
 )
 from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
@@ -175,10 +175,7 @@ def _measure_by_psf(
 
 def _first_reason(*reasons: tuple[Mask, StarRefusal]) -> NDArray[np.uint8]:
     """Codes (n,) of the first of the reasons whose mask (n,) holds; 0 without any."""
-    codes = np.zeros(len(reasons[0][0]), np.uint8)
-    for mask, code in reversed(reasons):
-        codes[mask] = code
-    return codes
+    return np.select(*zip(*reasons, strict=True)).astype(np.uint8)
 
 
 def _brightest_beside(
@@ -285,15 +282,13 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     """Return True if most bright stars have another shape than the model: streaks, or defocus."""
     if measured.fit is None:
         return False
-    # Few stars of a narrow field are bright, and light spread along streaks has more noise.
-    for least_snr in (BRIGHT_SNR, SHOWN_SNR):
-        shown = measured.fit.snr > least_snr
-        change = measured.fit.shape_change[shown]
-        if len(change) >= FEWEST_BRIGHT:
-            noise = _OF_MEDIAN * medians(measured.fit.shape_sigma[shown]) / math.sqrt(len(change))
-            departure = np.abs(medians(change) - model.shape_median)
-            return bool((departure > np.maximum(_COMMON_CHANGE, 4.0 * noise)).any())
-    return False
+    shown = showing_psf(measured.fit.snr)
+    change = measured.fit.shape_change[shown]
+    if len(change) < FEWEST_BRIGHT:
+        return False
+    noise = _OF_MEDIAN * medians(measured.fit.shape_sigma[shown]) / math.sqrt(len(change))
+    departure = np.abs(medians(change) - model.shape_median)
+    return bool((departure > np.maximum(_COMMON_CHANGE, 4.0 * noise)).any())
 
 
 def _without_neighbours(
@@ -493,11 +488,7 @@ def learn(
     # The lens changes the shape of all stars alike; this is not the noise of a pixel.
     plain = stars[measured.fit.worst_pixel_sigma[stars] <= psf_fit.MISFIT_SIGMA]
     stars = plain if len(plain) >= FEWEST_BRIGHT else stars
-    # Few stars of a narrow field are bright.
-    for least_snr in (BRIGHT_SNR, SHOWN_SNR):
-        bright = stars[measured.fit.snr[stars] > least_snr][:_MOST]
-        if len(bright) >= FEWEST_BRIGHT:
-            break
+    bright = stars[showing_psf(measured.fit.snr[stars])][:_MOST]
     # Fainter stars show no PSF error, so that it can be separated from photon noise.
     shown = stars[:_MOST]
     noise = psf_fit.noise_sums(
