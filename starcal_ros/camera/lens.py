@@ -61,8 +61,6 @@ class LensModel:
         The ideal plane has the angle from the optical axis in place of its tangent.
     is_redundant : bool
         Coefficients of the numerator and the denominator can grow together without an effect.
-    is_guarded : bool
-        Newton's method may start beyond the fold or a pole, from where it does not return.
     ros, ros_order : str, tuple of int
         ``distortion_model`` of a ``CameraInfo``, and the place of each number of its D.
     ros_aliases : tuple of str
@@ -88,7 +86,6 @@ class LensModel:
     equations: tuple[str, ...]
     is_angular: bool = False
     is_redundant: bool = False
-    is_guarded: bool = True
     opencv: str = ''
     mrcal: str = ''
     giant: str = ''
@@ -387,7 +384,6 @@ def _of_opencv(
         (0, 1, 3, 4, 2, *range(5, len(coefficients))),  # ROS has k3 after p1 and p2
         _RATIONAL_EQUATIONS if is_rational else _BROWN_EQUATIONS,
         is_redundant=is_rational,
-        is_guarded=is_rational,
         opencv='pinhole',
         mrcal=mrcal,
         giant=giant,

@@ -364,8 +364,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
         pixels = pixels - field.displacement_px(pixels)
     target = _plane_points(camera, pixels)
     # Newton's method does not return from beyond a fold or a pole: start and steps stay inside.
-    guarded = camera.lens.is_guarded
-    xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
+    xy = _inside(0.0 * target, target, fold2)
     error = np.full(target.shape, np.inf)
     for _ in range(_INVERSE_STEPS):
         error = camera.lens.distort(xy, distortion) - target
@@ -385,7 +384,7 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
                 length = np.hypot(step[..., 0], step[..., 1])
                 step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
                 step[np.isnan(step)] = 0.0
-        xy = _inside(xy, xy - step, fold2) if guarded else xy - step
+        xy = _inside(xy, xy - step, fold2)
     determinant = _determinant(camera.lens.by_ideal(xy, distortion))
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
