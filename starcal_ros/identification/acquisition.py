@@ -21,7 +21,7 @@ from starcal_ros.identification.prediction import (
     fit_warp,
     in_image,
     Prediction,
-    warp_powers,
+    warp_degree,
     window_area,
 )
 from starcal_ros.robust_statistics import median, medians
@@ -252,7 +252,8 @@ def _match(
     if len(pairs) >= 4:
         xy = xy + correction
     # Rotation, scale, cubic and warp were fitted: two parameters can make one false pair match.
-    false_pairs = 3 + len(warp_powers(len(pairs)))
+    degree = warp_degree(len(pairs))
+    false_pairs = 3 + (degree + 1) * (degree + 2) // 2
     places = _places(camera, len(pairs), *reach)
     _check_beyond_chance(xy[bright], seen, false_pairs, places, camera)
     return xy
@@ -264,7 +265,7 @@ def _places(camera: CameraModel, pairs: int, reach_px: float, roll_rad: float) -
 
     Infinite for fits with a warp, whose freedom is the number of false pairs that it can make.
     """
-    if len(warp_powers(pairs)) > 1:
+    if warp_degree(pairs) > 0:
         return np.inf
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height) / _MET_PX
     scales = (_MOST_SCALE - _SCALE_RANGE) * half_diagonal_px

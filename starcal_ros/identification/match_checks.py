@@ -13,12 +13,12 @@ Brightnesses do not match then.
 from __future__ import annotations
 
 import numpy as np
-from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
+from starcal_ros.identification.prediction import polynomial_terms
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median, RAYLEIGH_TO_SIGMA
 from starcal_ros.stars.centroiding import Centroids
@@ -66,10 +66,8 @@ def find_line_loss(
     if not usable.any():
         return None
     rows, steps = rows[usable], below[:, usable].astype(np.float64)
-    u, v = ((predicted_px - np.array([width, height]) / 2.0) / (max(width, height) / 2.0)).T
-    smooth = polyvander2d(u, v, [degree, degree])
-    powers = np.arange(degree + 1)
-    smooth = smooth[:, np.add.outer(powers, powers).ravel() <= degree]
+    middle_px = np.array([width, height]) / 2.0
+    smooth = polynomial_terms((predicted_px - middle_px) / middle_px.max(), degree)
     root = 1.0 / np.hypot(sigma_px, _FLOOR_PX)
     weight = root
     for power in (0.5, 1.0, 1.0, 1.0):
