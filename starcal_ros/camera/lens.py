@@ -197,9 +197,9 @@ class _OpenCv:
     """A perspective model of OpenCV: radial and decentring terms, and the parts that it adds."""
 
     count: int  # coefficients
-    has_denominator: bool = True
-    has_prism: bool = True
-    has_tilt: bool = True
+    has_denominator: bool
+    has_prism: bool
+    has_tilt: bool
 
     def distort(self, ideal: Floats, coefficients: Floats) -> Floats:
         x, y = ideal[..., 0], ideal[..., 1]
@@ -368,33 +368,33 @@ def _least_positive_root(polynomial: object) -> float:
     return float(real.min(initial=np.inf))
 
 
-def _of_opencv(
-    name: str, coefficients: tuple[str, ...], parts: _OpenCv, mrcal: str = '', giant: str = ''
-) -> LensModel:
-    """Row of a perspective model of OpenCV."""
-    is_rational = parts.has_denominator
+_BROWN = ('k1', 'k2', 'k3', 'p1', 'p2')
+_OPENCV_COEFFICIENTS = (*_BROWN, 'k4', 'k5', 'k6', 's1', 's2', 's3', 's4', 'tau_x', 'tau_y')
+
+
+def _of_opencv(name: str, count: int) -> LensModel:
+    """Row of the perspective model of OpenCV with the first coefficients of its list."""
+    is_rational, has_tilt = count >= 8, count >= 14
+    parts = _OpenCv(count, is_rational, has_prism=count >= 12, has_tilt=has_tilt)
     return LensModel(
         name,
-        coefficients,
+        _OPENCV_COEFFICIENTS[:count],
         parts.distort,
         parts.by_ideal,
         parts.by_coefficients,
         parts.fold_radius2,
         'rational_polynomial' if is_rational else 'plumb_bob',
-        (0, 1, 3, 4, 2, *range(5, len(coefficients))),  # ROS has k3 after p1 and p2
+        (0, 1, 3, 4, 2, *range(5, count)),  # ROS has k3 after p1 and p2
         _RATIONAL_EQUATIONS if is_rational else _BROWN_EQUATIONS,
         is_redundant=is_rational,
         opencv='pinhole',
-        mrcal=mrcal,
-        giant=giant,
+        mrcal='' if has_tilt else f'LENSMODEL_OPENCV{count}',
+        giant='' if has_tilt else 'OpenCVModel',
         ros_aliases=('thin_prism', 'thin_prism_fraunhofer') if is_rational else (),
         fewest=None if is_rational else 4,  # ROS 1 wrote no k3
     )
 
 
-_BROWN = ('k1', 'k2', 'k3', 'p1', 'p2')
-_RATIONAL = (*_BROWN, 'k4', 'k5', 'k6')
-_PRISM = (*_RATIONAL, 's1', 's2', 's3', 's4')
 _BROWN_EQUATIONS = (
     'g  = 1 + k1 r2 + k2 r2^2 + k3 r2^3',
     "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)",
@@ -428,28 +428,10 @@ _EQUIDISTANT = LensModel(
 LENSES: dict[str, LensModel] = {
     lens.name: lens
     for lens in (
-        _of_opencv(
-            'plumb_bob',
-            _BROWN,
-            _OpenCv(5, has_denominator=False, has_prism=False, has_tilt=False),
-            mrcal='LENSMODEL_OPENCV5',
-            giant='OpenCVModel',
-        ),
-        _of_opencv(
-            'rational_polynomial',
-            _RATIONAL,
-            _OpenCv(8, has_prism=False, has_tilt=False),
-            mrcal='LENSMODEL_OPENCV8',
-            giant='OpenCVModel',
-        ),
-        _of_opencv(
-            'thin_prism',
-            _PRISM,
-            _OpenCv(12, has_tilt=False),
-            mrcal='LENSMODEL_OPENCV12',
-            giant='OpenCVModel',
-        ),
-        _of_opencv('tilted', (*_PRISM, 'tau_x', 'tau_y'), _OpenCv(14)),
+        _of_opencv('plumb_bob', 5),
+        _of_opencv('rational_polynomial', 8),
+        _of_opencv('thin_prism', 12),
+        _of_opencv('tilted', 14),
         _EQUIDISTANT,
     )
 }
