@@ -303,7 +303,7 @@ def project_jacobians(
     J_rotation : (..., 2, 3)
         By the passive small rotation ``dtheta`` of the camera frame, rad (Eqs. 31, 34-37).
     """
-    xy = _ideal_in_front(camera.model, directions_camera)
+    xy = lens.ideal_points(camera.model, np.asarray(directions_camera, np.float64))
     fx, skew, fy, _, _ = camera.intrinsics
     distorted = camera.lens.distort(xy, camera.distortion)
     xd, yd = distorted[..., 0], distorted[..., 1]
@@ -329,7 +329,7 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
 
     Directions (..., 3) in the camera frame; Z > 0 for a perspective model.
     """
-    xy = _ideal_in_front(camera.model, directions_camera)
+    xy = lens.ideal_points(camera.model, np.asarray(directions_camera, np.float64))
     fx, skew, fy, _, _ = camera.intrinsics
     J_xy = camera.lens.by_ideal(xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
@@ -339,15 +339,6 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
     J[..., 0, :] = J_u[..., 0, None] * x_theta + J_u[..., 1, None] * y_theta
     J[..., 1, :] = J_v[..., 0, None] * x_theta + J_v[..., 1, None] * y_theta
     return J
-
-
-def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
-    """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
-    e = np.asarray(directions_camera, np.float64)
-    if lens.LENSES[model].is_angular:
-        return lens.ideal_points(model, e)
-    z_inverse = 1.0 / e[..., 2]
-    return np.asarray(e[..., :2] * z_inverse[..., None])
 
 
 def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
