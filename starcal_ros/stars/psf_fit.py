@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
 from starcal_ros.arrays import Floats, Mask, rows_of
-from starcal_ros.stars.hot_pixels import CORE_PX, SPILT
+from starcal_ros.stars.hot_pixels import CORE_PX, lit_alone
 from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
 
 _FIT_STEPS = 4  # stars converge in two or three; other sources may not
@@ -266,15 +266,13 @@ def _single_misfits(
     v, u = np.divmod(pixel, width)
     x, y = parameters[star, :2].T + width // 2
     away = np.hypot(u - x, v - y) > CORE_PX
-    if not away.any():
-        return star[away], pixel[away]
     star, pixel, v, u = star[away], pixel[away], v[away], u[away]
-    rimmed = np.zeros((len(star), width + 2, width + 2))
     left_dn = stamps.flat_dn[star] - light[star] - parameters[star, 3, None]
+    # Dark rims: the stamps lie below each other.
+    rimmed = np.zeros((len(star), width + 2, width + 2))
     rimmed[:, 1:-1, 1:-1] = left_dn.reshape(-1, width, width)
-    row = np.arange(len(star))
-    beside = sum(rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2)))
-    alone = 0.25 * beside < SPILT * left_dn[row, pixel]
+    row = np.arange(len(star)) * (width + 2)
+    alone = lit_alone(rimmed.reshape(-1, width + 2), row + v + 1, u + 1, 0.0)
     return star[alone], pixel[alone]
 
 
