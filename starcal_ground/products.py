@@ -91,7 +91,7 @@ def camera_info_text(camera: CameraModel, camera_name: str) -> str:
     ROS camera YAML as camera_info_manager reads it: the best camera without skew.
 
     Readers of ``CameraInfo`` ignore K[0,1] without a word, so it is 0 and the other parameters
-    make up for it as well as they can (`ros_fit`).
+    make up for it as well as they can (`CameraModel.ros_fit`).
     """
     info = camera_info_fields(camera)
     content = {

@@ -23,7 +23,7 @@ from scipy.special import betainc
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel, line_of_sight, project, rotation_jacobian
-from starcal_ros.camera.lens import coefficient_jacobian, distort, ideal_points
+from starcal_ros.camera.lens import ideal_points
 from starcal_ros.sky.catalog import StarCatalog
 
 _CROWDED = 0.15  # largest probability that a source lies by chance within the radius of matching
@@ -241,9 +241,9 @@ def star_equations(
     fx, skew, fy, cx, cy = camera.intrinsics.tolist()
     directions = directions_icrs @ camera_from_icrf.as_matrix().T
     ideal = ideal_points(camera.model, directions)
-    xd, yd = distort(camera.model, ideal, camera.distortion).T
+    xd, yd = camera.lens.distort(ideal, camera.distortion).T
     x_by_k1, y_by_k1 = (fx / half_px) ** 2 * (
-        coefficient_jacobian(camera.model, ideal, camera.distortion)[:, 0]
+        camera.lens.by_coefficients(ideal, camera.distortion)[:, 0]
     )
     J = np.zeros((2, len(ideal), 7))
     J[:, :, :3] = rotation_jacobian(camera, directions).transpose(1, 0, 2)

@@ -47,7 +47,7 @@ from starcal_ros.estimation.search import problem_of, start_of
 from starcal_ros.estimation.star_equations import arrange, star_table
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions, EntryInputs, IMAGE_ROTATION, unknowns_of
-from starcal_ros.identification.prediction import predict, within_image
+from starcal_ros.identification.prediction import predict
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.pipeline.solve import aligned_by, estimated
 from starcal_ros.processes import one_blas_thread
@@ -450,18 +450,14 @@ def _expected(
     geometry, last = estimate.geometry, ensemble.images[-1]
     star_tracker = pointing.icrf_from_camera * geometry.star_tracker_from_camera.inv()
     camera = geometry.camera
-    stars = within_image(
-        predict(
-            geometry,
-            star_tracker.as_quat(),
-            last.time_ns,
-            setup.catalog,
-            float(np.quantile(estimate.table.magnitude, _FAINTEST)),
-            0.0,
-            site=setup.site,
-        ),
-        camera.width,
-        camera.height,
+    stars = predict(
+        geometry,
+        star_tracker.as_quat(),
+        last.time_ns,
+        setup.catalog,
+        float(np.quantile(estimate.table.magnitude, _FAINTEST)),
+        0.0,
+        site=setup.site,
     )
     magnitude = setup.catalog.magnitude[stars.catalog_index]
     variance = expected_noise_px2(estimate, magnitude)

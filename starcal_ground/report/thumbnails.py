@@ -17,7 +17,7 @@ from starcal_ground.products import make_folder
 from starcal_ground.written_files import write_marked
 from starcal_ros.arrays import Pixels
 from starcal_ros.errors import errors_as, ProductError
-from starcal_ros.identification.prediction import predict, within_image
+from starcal_ros.identification.prediction import predict
 from starcal_ros.pipeline.annotation import annotate_reduced, stretch
 from starcal_ros.pipeline.setup import Setup
 from starcal_ros.records import CameraGeometry, Image, StarObservations
@@ -196,7 +196,6 @@ def _expected_picture(
         setup.identification.magnitude_limit,
     )
     stars = predict(geometry, attitude, image.time_ns, setup.catalog, limit, 0.0)
-    stars = within_image(stars, geometry.camera.width, geometry.camera.height)
     scale = min(1.0, _EXPECTED_WIDTH_PX / image.pixels.shape[1])
     grey = cv2.resize(
         stretch(image.pixels), None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA

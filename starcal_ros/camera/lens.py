@@ -49,15 +49,18 @@ class LensModel:
     ----------
     coefficients : tuple of str
         Names, in order; the functions take the numbers as (c,), or (c, n) for n points.
-    distort, by_ideal, by_coefficients, fold_radius2 : callable
-        As the functions `distort`, `distort_jacobian`, `coefficient_jacobian` and `fold_radius2`
-        of this module, without the name of the model.
+    distort : callable
+        Distorted points (..., 2) of ideal points (..., 2) and coefficients (Eq. 6 for
+        ``plumb_bob``); NaN where ``tilted`` would look at the detector from behind.
+    by_ideal, by_coefficients : callable
+        Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37), and (2, c, ...) by
+        the c coefficients, of the same arguments.
+    fold_radius2 : callable
+        As the function of this module, of each coefficient as a number.
     is_angular : bool
         The ideal plane has the angle from the optical axis in place of its tangent.
     is_redundant : bool
         Coefficients of the numerator and the denominator can grow together without an effect.
-    is_guarded : bool
-        Newton's method may start beyond the fold or a pole, from where it does not return.
     ros, ros_order : str, tuple of int
         ``distortion_model`` of a ``CameraInfo``, and the place of each number of its D.
     ros_aliases : tuple of str
@@ -83,7 +86,6 @@ class LensModel:
     equations: tuple[str, ...]
     is_angular: bool = False
     is_redundant: bool = False
-    is_guarded: bool = True
     opencv: str = ''
     mrcal: str = ''
     giant: str = ''
@@ -174,25 +176,6 @@ def _bend(r2: Floats) -> Floats:
     return np.where(near, series, (1.0 - far / np.tan(far)) / far2)
 
 
-def distort(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """
-    Distorted points (..., 2) of ideal ones (..., 2) (Eq. 6 for ``plumb_bob``).
-
-    NaN where ``tilted`` would look at the detector from behind.
-    """
-    return LENSES[model].distort(ideal, coefficients)
-
-
-def distort_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """Derivatives (..., 2, 2) of `distort` by the ideal points (Eqs. 36, 37)."""
-    return LENSES[model].by_ideal(ideal, coefficients)
-
-
-def coefficient_jacobian(model: str, ideal: Floats, coefficients: Floats) -> Floats:
-    """Derivatives (2, c, ...) of `distort` at ideal points (..., 2) by the c coefficients."""
-    return LENSES[model].by_coefficients(ideal, coefficients)
-
-
 def fold_radius2(model: str, coefficients: Floats) -> float:
     """
     Squared radius of the ideal plane from which the radial distortion has no inverse.
@@ -214,9 +197,9 @@ class _OpenCv:
     """A perspective model of OpenCV: radial and decentring terms, and the parts that it adds."""
 
     count: int  # coefficients
-    has_denominator: bool = True
-    has_prism: bool = True
-    has_tilt: bool = True
+    has_denominator: bool
+    has_prism: bool
+    has_tilt: bool
 
     def distort(self, ideal: Floats, coefficients: Floats) -> Floats:
         x, y = ideal[..., 0], ideal[..., 1]
@@ -255,7 +238,7 @@ class _OpenCv:
             J[..., 0, :] += 2 * (s1 + 2 * s2 * r2)[..., None] * ideal
             J[..., 1, :] += 2 * (s3 + 2 * s4 * r2)[..., None] * ideal
         if self.has_tilt:
-            xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+            xd, yd = np.moveaxis(LENSES['thin_prism'].distort(ideal, coefficients[:12]), -1, 0)
             J = _tilt_jacobian(xd, yd, *coefficients[12:]) @ J
         return J
 
@@ -345,7 +328,7 @@ def _by_powers(J: Floats, x: Floats, y: Floats, r2: Floats) -> None:
 def _by_tilt(J: Floats, ideal: Floats, coefficients: Floats) -> None:
     """Derivatives (2, 14, ...) by the angles of the detector into J, the others through them."""
     tau_x, tau_y = coefficients[12:]
-    xd, yd = np.moveaxis(distort('thin_prism', ideal, coefficients[:12]), -1, 0)
+    xd, yd = np.moveaxis(LENSES['thin_prism'].distort(ideal, coefficients[:12]), -1, 0)
     J[:, :12] = np.einsum('...ij,jk...->ik...', _tilt_jacobian(xd, yd, tau_x, tau_y), J[:, :12])
     sx, cx, sy, cy = np.sin(tau_x), np.cos(tau_x), np.sin(tau_y), np.cos(tau_y)
     xt, yt, w = _tilt(xd, yd, tau_x, tau_y)
@@ -385,34 +368,33 @@ def _least_positive_root(polynomial: object) -> float:
     return float(real.min(initial=np.inf))
 
 
-def _of_opencv(
-    name: str, coefficients: tuple[str, ...], parts: _OpenCv, mrcal: str = '', giant: str = ''
-) -> LensModel:
-    """Row of a perspective model of OpenCV."""
-    is_rational = parts.has_denominator
+_BROWN = ('k1', 'k2', 'k3', 'p1', 'p2')
+_OPENCV_COEFFICIENTS = (*_BROWN, 'k4', 'k5', 'k6', 's1', 's2', 's3', 's4', 'tau_x', 'tau_y')
+
+
+def _of_opencv(name: str, count: int) -> LensModel:
+    """Row of the perspective model of OpenCV with the first coefficients of its list."""
+    is_rational, has_tilt = count >= 8, count >= 14
+    parts = _OpenCv(count, is_rational, has_prism=count >= 12, has_tilt=has_tilt)
     return LensModel(
         name,
-        coefficients,
+        _OPENCV_COEFFICIENTS[:count],
         parts.distort,
         parts.by_ideal,
         parts.by_coefficients,
         parts.fold_radius2,
         'rational_polynomial' if is_rational else 'plumb_bob',
-        (0, 1, 3, 4, 2, *range(5, len(coefficients))),  # ROS has k3 after p1 and p2
+        (0, 1, 3, 4, 2, *range(5, count)),  # ROS has k3 after p1 and p2
         _RATIONAL_EQUATIONS if is_rational else _BROWN_EQUATIONS,
         is_redundant=is_rational,
-        is_guarded=is_rational,
         opencv='pinhole',
-        mrcal=mrcal,
-        giant=giant,
+        mrcal='' if has_tilt else f'LENSMODEL_OPENCV{count}',
+        giant='' if has_tilt else 'OpenCVModel',
         ros_aliases=('thin_prism', 'thin_prism_fraunhofer') if is_rational else (),
         fewest=None if is_rational else 4,  # ROS 1 wrote no k3
     )
 
 
-_BROWN = ('k1', 'k2', 'k3', 'p1', 'p2')
-_RATIONAL = (*_BROWN, 'k4', 'k5', 'k6')
-_PRISM = (*_RATIONAL, 's1', 's2', 's3', 's4')
 _BROWN_EQUATIONS = (
     'g  = 1 + k1 r2 + k2 r2^2 + k3 r2^3',
     "x' = g x + 2 p1 x y + p2 (r2 + 2 x^2)",
@@ -446,28 +428,10 @@ _EQUIDISTANT = LensModel(
 LENSES: dict[str, LensModel] = {
     lens.name: lens
     for lens in (
-        _of_opencv(
-            'plumb_bob',
-            _BROWN,
-            _OpenCv(5, has_denominator=False, has_prism=False, has_tilt=False),
-            mrcal='LENSMODEL_OPENCV5',
-            giant='OpenCVModel',
-        ),
-        _of_opencv(
-            'rational_polynomial',
-            _RATIONAL,
-            _OpenCv(8, has_prism=False, has_tilt=False),
-            mrcal='LENSMODEL_OPENCV8',
-            giant='OpenCVModel',
-        ),
-        _of_opencv(
-            'thin_prism',
-            _PRISM,
-            _OpenCv(12, has_tilt=False),
-            mrcal='LENSMODEL_OPENCV12',
-            giant='OpenCVModel',
-        ),
-        _of_opencv('tilted', (*_PRISM, 'tau_x', 'tau_y'), _OpenCv(14)),
+        _of_opencv('plumb_bob', 5),
+        _of_opencv('rational_polynomial', 8),
+        _of_opencv('thin_prism', 12),
+        _of_opencv('tilted', 14),
         _EQUIDISTANT,
     )
 }

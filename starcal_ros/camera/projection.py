@@ -6,7 +6,7 @@ The parameters are one vector, in this order everywhere::
 
     fx skew fy cx cy  then the coefficients of the lens model (`lens.LENSES`)
 
-With (x', y') the distorted point of the image plane (`lens.distort`)::
+With (x', y') the distorted point of the image plane (`lens.LensModel`)::
 
     u = fx x' + skew y' + cx
     v = fy y' + cy
@@ -55,6 +55,7 @@ _SHORT = 0.3  # a step that stays on the branch, on the ideal image plane
 _INVERSE_TOLERANCE = 1e-14  # on the ideal image plane: 4e-11 px at a focal length of 4000 px
 # Penalty of a fit for each unit by which a coefficient of a rational polynomial changes.
 _HELD_PX = 1e-2
+_EXACT_PX = 1e-9  # beyond the rounding of a projection and its inverse
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -128,12 +129,8 @@ class CameraModel(Record):
     @property
     def moving_field(self) -> DetectorField | None:
         """The field if it moves pixels, else None: a field of zeros only carries a covariance."""
-        return self.field if self.has_field else None
-
-    @property
-    def has_field(self) -> bool:
-        """True where a field moves pixels."""
-        return self.field is not None and bool(self.field.coefficients.any())
+        moves = self.field is not None and self.field.coefficients.any()
+        return self.field if moves else None
 
     @property
     def camera_matrix(self) -> Floats:
@@ -147,9 +144,14 @@ class CameraModel(Record):
         return {}
 
     @functools.cached_property
-    def _ros_fit(self) -> tuple[CameraModel, float]:
-        """Result of `ros_fit`, for which the budget and ``camera_info`` of a calibration ask."""
-        return nearest_camera(self, self.model, ('skew',))
+    def ros_fit(self) -> tuple[CameraModel, float]:
+        """
+        Best camera without skew and field, for readers of ``camera_info``, its worst error, px.
+
+        They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is
+        a rotation, which only the alignment could take up, so some error stays.
+        """
+        return convert(self, self.model, ('skew',))
 
     @property
     def opencv_coefficients(self) -> Floats:
@@ -226,7 +228,7 @@ def distortion_px(camera: CameraModel, pixels: Floats) -> Floats:
 
     The ideal lens is a pinhole; for ``equidistant`` the radius is proportional to the angle.
     """
-    distorted = lens.distort(camera.model, _plane_points(camera, pixels), camera.distortion)
+    distorted = camera.lens.distort(_plane_points(camera, pixels), camera.distortion)
     return _pixels(camera.intrinsics, distorted) - pixels
 
 
@@ -252,8 +254,8 @@ def project_parameters(model: str, parameters: Floats, directions_camera: Floats
     is given a direction at or behind the plane of the lens (Z <= 0).  Complex parameters or
     directions pass through, for complex-step derivatives.
     """
-    distorted = lens.distort(model, lens.ideal_points(model, directions_camera), parameters[5:])
-    return _pixels(parameters[:5], distorted)
+    ideal = lens.ideal_points(model, directions_camera)
+    return _pixels(parameters[:5], lens.LENSES[model].distort(ideal, parameters[5:]))
 
 
 def project(camera: CameraModel, directions_camera: Floats) -> Floats:
@@ -301,9 +303,9 @@ def project_jacobians(
     J_rotation : (..., 2, 3)
         By the passive small rotation ``dtheta`` of the camera frame, rad (Eqs. 31, 34-37).
     """
-    xy = _ideal_in_front(camera.model, directions_camera)
+    xy = lens.ideal_points(camera.model, np.asarray(directions_camera, np.float64))
     fx, skew, fy, _, _ = camera.intrinsics
-    distorted = lens.distort(camera.model, xy, camera.distortion)
+    distorted = camera.lens.distort(xy, camera.distortion)
     xd, yd = distorted[..., 0], distorted[..., 1]
 
     J_parameters = np.zeros((*xd.shape, 2, len(camera.parameters)))
@@ -312,7 +314,7 @@ def project_jacobians(
     J_parameters[..., 0, 3] = 1.0
     J_parameters[..., 1, 2] = yd
     J_parameters[..., 1, 4] = 1.0
-    columns = lens.coefficient_jacobian(camera.model, xy, camera.distortion)
+    columns = camera.lens.by_coefficients(xy, camera.distortion)
     for k, (column_x, column_y) in enumerate(zip(*columns, strict=True), start=5):
         J_parameters[..., 0, k] = fx * column_x + skew * column_y
         J_parameters[..., 1, k] = fy * column_y
@@ -327,9 +329,9 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
 
     Directions (..., 3) in the camera frame; Z > 0 for a perspective model.
     """
-    xy = _ideal_in_front(camera.model, directions_camera)
+    xy = lens.ideal_points(camera.model, np.asarray(directions_camera, np.float64))
     fx, skew, fy, _, _ = camera.intrinsics
-    J_xy = lens.distort_jacobian(camera.model, xy, camera.distortion)
+    J_xy = camera.lens.by_ideal(xy, camera.distortion)
     J_u = fx * J_xy[..., 0, :] + skew * J_xy[..., 1, :]
     J_v = fy * J_xy[..., 1, :]
     x_theta, y_theta = lens.ideal_by_rotation(camera.model, xy)
@@ -339,15 +341,6 @@ def rotation_jacobian(camera: CameraModel, directions_camera: Floats) -> Floats:
     return J
 
 
-def _ideal_in_front(model: str, directions_camera: Floats) -> Floats:
-    """Ideal points (..., 2) of directions (..., 3), none of them behind a perspective lens."""
-    e = np.asarray(directions_camera, np.float64)
-    if lens.LENSES[model].is_angular:
-        return lens.ideal_points(model, e)
-    z_inverse = 1.0 / e[..., 2]
-    return np.asarray(e[..., :2] * z_inverse[..., None])
-
-
 def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     """
     Unit directions (..., 3) in the camera frame of pixels (..., 2): the inverse of `project`.
@@ -355,21 +348,20 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
     Newton iteration on the distortion with its analytic Jacobian.  NaN beyond the fold of the
     model, where it has no inverse on the branch of the optical axis.
     """
-    model, distortion = camera.model, camera.distortion
-    fold2 = lens.fold_radius2(model, distortion)
+    distortion = camera.distortion
+    fold2 = lens.fold_radius2(camera.model, distortion)
     pixels = np.asarray(pixels, np.float64)
     if (field := camera.moving_field) is not None:
         pixels = pixels - field.displacement_px(pixels)
     target = _plane_points(camera, pixels)
     # Newton's method does not return from beyond a fold or a pole: start and steps stay inside.
-    guarded = camera.lens.is_guarded
-    xy = _inside(0.0 * target, target, fold2) if guarded else target.copy()
+    xy = _inside(0.0 * target, target, fold2)
     error = np.full(target.shape, np.inf)
     for _ in range(_INVERSE_STEPS):
-        error = lens.distort(model, xy, distortion) - target
+        error = camera.lens.distort(xy, distortion) - target
         if np.abs(error).max(initial=0.0) < _INVERSE_TOLERANCE:
             break
-        J = lens.distort_jacobian(model, xy, distortion)
+        J = camera.lens.by_ideal(xy, distortion)
         with np.errstate(all='ignore'):
             by_y, by_x = error[..., 1], error[..., 0]
             step = lens.points_of(
@@ -383,13 +375,13 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
                 length = np.hypot(step[..., 0], step[..., 1])
                 step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
                 step[np.isnan(step)] = 0.0
-        xy = _inside(xy, xy - step, fold2) if guarded else xy - step
-    determinant = _determinant(lens.distort_jacobian(model, xy, distortion))
+        xy = _inside(xy, xy - step, fold2)
+    determinant = _determinant(camera.lens.by_ideal(xy, distortion))
     # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
     r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
     xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
-    return lens.directions_of(model, xy)
+    return lens.directions_of(camera.model, xy)
 
 
 def _determinant(J: Floats) -> Floats:
@@ -440,20 +432,13 @@ def field_radius_rad(camera: CameraModel, margin_px: float = 0.0) -> float:
     return camera._field_radii_rad.setdefault(margin_px, radius_rad)
 
 
-def ros_fit(camera: CameraModel) -> tuple[CameraModel, float]:
-    """
-    Best camera without skew and field, for readers of ``camera_info``, and its worst error, px.
-
-    They ignore the skew K[0,1], but their OpenCV has every lens model here.  Half of a skew is a
-    rotation, which only the alignment could take up, so some error stays.
-    """
-    return camera._ros_fit
-
-
-def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
+def convert(
+    camera: CameraModel, model: str, zero: tuple[str, ...] = ()
+) -> tuple[CameraModel, float]:
     """
     Best camera of a lens model for the lines of sight of another camera, and its worst error.
 
+    It has no field, and the parameters of the names ``zero`` are zero, for formats without them.
     Least squares over a 25 x 25 grid of the detector, starting with the coefficients that both
     models have.  Raises ValueError for an unknown model.
 
@@ -464,36 +449,14 @@ def convert(camera: CameraModel, model: str) -> tuple[CameraModel, float]:
         Largest pixel error over the grid; infinite where the model cannot see all of it, or no
         camera of the model is found.
     """
-    if camera.has_lens(model) and not camera.has_field:
-        return dataclasses.replace(camera, field=None), 0.0
     is_angular = lens.lens_named(model).is_angular
     names = parameter_names(model)
-    known = dict(zip(camera.parameter_names, camera.parameters, strict=True))
-    same_plane = not (is_angular or camera.lens.is_angular)
-    start = np.array([known.get(name, 0.0) for name in names])
-    if not same_plane:
-        start[5:] = 0.0
-    started = CameraModel(camera.width, camera.height, start, model)
-    if same_plane and known.keys() <= set(names) and not camera.has_field:
-        return started, 0.0  # a special case of the larger model
-    return _fit(started, list(range(len(names))), camera)
-
-
-def nearest_camera(
-    camera: CameraModel, model: str, zero: tuple[str, ...]
-) -> tuple[CameraModel, float]:
-    """
-    As `convert`, without field and with some parameters held at zero, for formats without them.
-
-    Raises ValueError for an unknown model, or a name that is not one of its parameters.
-    """
-    start = camera if camera.has_lens(model) else convert(camera, model)[0]
-    start = dataclasses.replace(start.replace(**dict.fromkeys(zero, 0.0)), field=None)
-    unchanged = not camera.has_field and camera.has_lens(model)
-    if unchanged and np.array_equal(start.parameters, camera.parameters):
-        return start, 0.0
-    free = [k for k, name in enumerate(start.parameter_names) if name not in zero]
-    return _fit(start, free, camera)
+    same_plane = camera.has_lens(model) or not (is_angular or camera.lens.is_angular)
+    shared = camera.parameter_names if same_plane else INTRINSIC_NAMES
+    known = dict(zip(shared, camera.parameters, strict=False))
+    values = [0.0 if name in zero else known.get(name, 0.0) for name in names]
+    started = CameraModel(camera.width, camera.height, np.array(values), model)
+    return _fit(started, [k for k, name in enumerate(names) if name not in zero], camera)
 
 
 def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[CameraModel, float]:
@@ -502,7 +465,16 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
     directions = line_of_sight(camera, target)
     exists = np.isfinite(directions[:, 0])
     target, directions = target[exists], directions[exists]
-    visible = np.isfinite(project(start, directions)).all(axis=1)
+
+    def error_px(fitted: CameraModel) -> Floats:
+        error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
+        return np.where(np.isnan(error), np.inf, error)
+
+    start_error_px = error_px(start)
+    # The same lens, or a special case of a larger model.
+    if (start_error_px < _EXACT_PX).all():
+        return start, 0.0
+    visible = np.isfinite(start_error_px)
 
     def moved(x: Floats) -> CameraModel:
         parameters = start.parameters.copy()
@@ -541,5 +513,4 @@ def _fit(start: CameraModel, free: list[int], camera: CameraModel) -> tuple[Came
         fitted = moved(solution.x)
     except ValueError:  # a step to a camera that cannot be, or to no number
         return start, math.inf
-    error = np.linalg.norm(project(fitted, directions) - target, axis=-1)
-    return fitted, float(np.where(np.isnan(error), np.inf, error).max(initial=0.0))
+    return fitted, float(error_px(fitted).max(initial=0.0))

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera import CameraModel
-from starcal_ros.camera.lens import coefficient_jacobian, LENSES
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD, NANOSECONDS_PER_SECOND
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.equations import arrow, stars_alone
@@ -141,10 +141,10 @@ def _default_sigma(camera: CameraModel, options: CalibrationOptions) -> Floats:
     it.
     """
     corner = 0.5 * np.array([camera.width, camera.height]) / camera.parameters[0]
-    none = np.zeros(len(LENSES[camera.model].coefficients))
+    lens = camera.lens
+    none = np.zeros(len(lens.coefficients))
     effect, half_way = (
-        np.linalg.norm(coefficient_jacobian(camera.model, part * corner, none), axis=0)
-        for part in (1.0, 0.5)
+        np.linalg.norm(lens.by_coefficients(part * corner, none), axis=0) for part in (1.0, 0.5)
     )
     beyond_third = np.maximum(np.log2(effect / half_way) - 3.0, 0.0)
     falling = min(float(np.linalg.norm(corner)) / _SERIES_RAD, 1.0) ** beyond_third

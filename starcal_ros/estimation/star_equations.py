@@ -18,13 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats
-from starcal_ros.camera.lens import (
-    coefficient_jacobian,
-    distort,
-    distort_jacobian,
-    ideal_by_rotation,
-    ideal_points,
-)
+from starcal_ros.camera.lens import ideal_by_rotation, ideal_points, LENSES
 from starcal_ros.estimation.limits import ROWS_AT_ONCE
 from starcal_ros.records import StarObservations
 
@@ -247,7 +241,8 @@ def _whitened_columns(
     ideal = ideal_points(model, e.reshape(3, m * n).T)
     fx, skew, fy, cx, cy = parameters[:5]
     coefficients = parameters[5:]
-    xd, yd = distort(model, ideal, coefficients).T
+    lens = LENSES[model]
+    xd, yd = lens.distort(ideal, coefficients).T
     if not np.isfinite(xd).all():
         return False
     p = len(parameters)
@@ -257,11 +252,11 @@ def _whitened_columns(
     U, V = J
     U[0], U[1], U[2], U[3], U[4] = wuu * xd, wuu * yd, wuv * yd, wuu, wuv
     V[:2], V[2], V[3], V[4] = 0.0, wvv * yd, 0.0, wvv
-    by_x, by_y = coefficient_jacobian(model, ideal, coefficients)
+    by_x, by_y = lens.by_coefficients(ideal, coefficients)
     np.multiply(uu, by_x, out=U[5:p])
     U[5:p] += uv * by_y
     np.multiply(vv, by_y, out=V[5:p])
-    (x_x, x_y), (y_x, y_y) = distort_jacobian(model, ideal, coefficients).transpose(1, 2, 0)
+    (x_x, x_y), (y_x, y_y) = lens.by_ideal(ideal, coefficients).transpose(1, 2, 0)
     x_theta, y_theta = ideal_by_rotation(model, ideal).transpose(0, 2, 1)
     rotation = slice(-5, -2)
     for W, of_x, of_y in ((U, uu * x_x + uv * y_x, uu * x_y + uv * y_y), (V, vv * y_x, vv * y_y)):

@@ -21,10 +21,9 @@ from starcal_ros.identification.prediction import (
     fit_warp,
     in_image,
     Prediction,
-    warp_powers,
+    warp_degree,
     window_area,
 )
-from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians
 from starcal_ros.stars.detection import Sources
 from starcal_ros.text import counted
@@ -47,13 +46,7 @@ _LOOKS = 10.0  # number of independent tests among depths, which share most star
 _MAX_P_VALUE = 1e-9  # p-value of the matched stars, given a wrong match
 
 
-def acquire(
-    prediction: Prediction,
-    sources: Sources,
-    geometry: CameraGeometry,
-    reach_px: float,
-    roll_rad: float,
-) -> Floats:
+def acquire(prediction: Prediction, sources: Sources, reach_px: float, roll_rad: float) -> Floats:
     """
     Predicted pixels (n, 2) corrected to match the sources of the image.
 
@@ -69,13 +62,13 @@ def acquire(
             continue
         brightest = sources.select(slice(depth))
         try:
-            turn = _vote(prediction, brightest, geometry, reach_px, roll_rad)
-            found_px = _match(prediction, brightest, geometry, turn, (reach_px, roll_rad))
+            turn = _vote(prediction, brightest, reach_px, roll_rad)
+            found_px = _match(prediction, brightest, turn, (reach_px, roll_rad))
         except ImageRefused as error:
             # The first attempt uses every source: its numbers describe the image.
             refused = refused or error
             continue
-        inside = in_image(found_px, geometry.camera.width, geometry.camera.height)
+        inside = in_image(found_px, prediction.camera)
         brightest_px = found_px[inside][: 2 * _DEPTHS[0]]
         met = len(_pairs(brightest_px, sources.xy_px[: _DEPTHS[0]], _MET_PX))
         if met > most:
@@ -87,13 +80,7 @@ def acquire(
     return best_px
 
 
-def _vote(
-    prediction: Prediction,
-    sources: Sources,
-    geometry: CameraGeometry,
-    reach_px: float,
-    roll_rad: float,
-) -> Rotation:
+def _vote(prediction: Prediction, sources: Sources, reach_px: float, roll_rad: float) -> Rotation:
     """
     Small rotation of the camera frame that moves the predictions near their sources.
 
@@ -102,7 +89,7 @@ def _vote(
 
     Raises ImageRefused ``no_match`` if the count of the best cell is consistent with chance.
     """
-    camera = geometry.camera
+    camera = prediction.camera
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
     # Large enough for the errors of the prior focal length and the roll step at the edge, but
     # small against the search range: a cell as large as the range would count everything.
@@ -118,7 +105,7 @@ def _vote(
     # number of the sources into an image of a window up to twice its area, and once in a larger.
     window = window_area(camera, reach_px)
     count = min(_VOTERS, 2 * len(sources.snr)) * max(1.0, window / 2.0)
-    in_window = in_image(prediction.xy_px, camera.width, camera.height, reach_px)
+    in_window = in_image(prediction.xy_px, camera, reach_px)
     stars = prediction.xy_px[in_window][: int(count)] - centre
     seen = sources.xy_px[:_VOTERS] - centre
     votes, roll, low = _fullest_block(stars, seen, cell_px, half_cells, rolls_rad)
@@ -185,7 +172,6 @@ def _pairs(predicted_px: Floats, sources_px: Floats, radius_px: float) -> Indice
 def _refine_rotation(
     prediction: Prediction,
     sources: Sources,
-    geometry: CameraGeometry,
     start: Rotation,
     stars: Indices,
 ) -> tuple[Floats, Indices]:
@@ -195,7 +181,7 @@ def _refine_rotation(
     Robust Gauss-Newton on the small rotation and one common scale with a decreasing matching
     radius; only ``stars`` (rows of the prediction) are matched to the sources.
     """
-    camera = geometry.camera
+    camera = prediction.camera
     centre = camera.parameters[3:5]
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height)
     rotation, scale, cubic = start, 1.0, 0.0
@@ -237,7 +223,6 @@ def _refine_rotation(
 def _match(
     prediction: Prediction,
     sources: Sources,
-    geometry: CameraGeometry,
     rotation: Rotation,
     reach: tuple[float, float],
 ) -> Floats:
@@ -247,15 +232,15 @@ def _match(
     Raises ImageRefused ``no_match`` if the number of matched predictions is consistent with
     chance.
     """
-    camera = geometry.camera
+    camera = prediction.camera
     # Equal numbers of predictions and sources: the fainter surplus has no counterpart.
     margin_px = 0.02 * np.hypot(camera.width, camera.height)
     turned_px = project(camera, rotation.apply(prediction.direction_camera))
     with np.errstate(invalid='ignore'):
-        bright = np.flatnonzero(in_image(turned_px, camera.width, camera.height, margin_px))
+        bright = np.flatnonzero(in_image(turned_px, camera, margin_px))
     bright = bright[: min(4 * len(sources.snr), 400)]
     seen = sources.select(slice(4 * len(bright)))
-    xy, pairs = _refine_rotation(prediction, seen, geometry, rotation, bright)
+    xy, pairs = _refine_rotation(prediction, seen, rotation, bright)
     half_px = 0.5 * max(camera.width, camera.height)
     for radius_px in (max(4.0, 0.003 * half_px * 2), 3.0, 2.0):
         if len(pairs) < 4:
@@ -267,9 +252,10 @@ def _match(
     if len(pairs) >= 4:
         xy = xy + correction
     # Rotation, scale, cubic and warp were fitted: two parameters can make one false pair match.
-    false_pairs = 3 + len(warp_powers(len(pairs)))
+    degree = warp_degree(len(pairs))
+    false_pairs = 3 + (degree + 1) * (degree + 2) // 2
     places = _places(camera, len(pairs), *reach)
-    _check_beyond_chance(xy[bright], seen, false_pairs, places, camera.width, camera.height)
+    _check_beyond_chance(xy[bright], seen, false_pairs, places, camera)
     return xy
 
 
@@ -279,7 +265,7 @@ def _places(camera: CameraModel, pairs: int, reach_px: float, roll_rad: float) -
 
     Infinite for fits with a warp, whose freedom is the number of false pairs that it can make.
     """
-    if len(warp_powers(pairs)) > 1:
+    if warp_degree(pairs) > 0:
         return np.inf
     half_diagonal_px = 0.5 * np.hypot(camera.width, camera.height) / _MET_PX
     scales = (_MOST_SCALE - _SCALE_RANGE) * half_diagonal_px
@@ -293,8 +279,7 @@ def _check_beyond_chance(
     sources: Sources,
     false_pairs: int,
     places: float,
-    width: int,
-    height: int,
+    camera: CameraModel,
 ) -> None:
     """
     Refuse the match if the number of predictions (n, 2) on a source is consistent with chance.
@@ -304,7 +289,7 @@ def _check_beyond_chance(
 
     Raises ImageRefused ``no_match``.
     """
-    inside = in_image(predicted_px, width, height)
+    inside = in_image(predicted_px, camera)
     radius_px = _MET_PX
     met = _pairs(predicted_px[inside], sources.xy_px, radius_px)
     matched = len(met)
@@ -323,11 +308,11 @@ def _check_beyond_chance(
             f'{matched} of {tried} predicted stars match a source, {expected:.0f} expected by'
             ' chance',
         )
-    if _matched_in_part(sources, met[:, 1], width, height):
+    if _matched_in_part(sources, met[:, 1], camera):
         raise ImageRefused('no_match', 'stars match in one part of the image only')
 
 
-def _matched_in_part(sources: Sources, met: Indices, width: int, height: int) -> bool:
+def _matched_in_part(sources: Sources, met: Indices, camera: CameraModel) -> bool:
     """
     Return True if bright sources are matched in one part of the image but not in most others.
 
@@ -338,15 +323,16 @@ def _matched_in_part(sources: Sources, met: Indices, width: int, height: int) ->
     bright = sources.snr >= median(sources.snr[met])
     meets = np.zeros(len(sources.snr), bool)
     meets[met] = True
-    part = part_of(sources.xy_px, width, height)
+    part = part_of(sources.xy_px, (camera.height, camera.width))
     shown = np.bincount(part[bright], minlength=PARTS)
     found = np.bincount(part[bright & meets], minlength=PARTS)
     missed = missed_parts(shown, found)
     return bool(2 * np.count_nonzero(missed) > np.count_nonzero(shown >= _FEWEST_IN_PART))
 
 
-def part_of(xy_px: Floats, width: int, height: int) -> Indices:
+def part_of(xy_px: Floats, shape: tuple[int, ...]) -> Indices:
     """Index (n,), 0 to `PARTS` - 1, of the part of the image that holds each point (n, 2)."""
+    height, width = shape
     cell = np.clip((xy_px * _SIDE / [width, height]).astype(np.int64), 0, _SIDE - 1)
     return np.asarray(cell[:, 1] * _SIDE + cell[:, 0])
 

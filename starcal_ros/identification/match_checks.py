@@ -13,12 +13,12 @@ Brightnesses do not match then.
 from __future__ import annotations
 
 import numpy as np
-from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
 
 from starcal_ros.arrays import Floats, Mask
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.acquisition import best_share, missed_parts, part_of, PARTS
+from starcal_ros.identification.prediction import polynomial_terms
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median, RAYLEIGH_TO_SIGMA
 from starcal_ros.stars.centroiding import Centroids
@@ -38,7 +38,7 @@ _FLOOR_PX = 0.05  # systematic error of star positions, per axis
 
 
 def find_line_loss(
-    predicted_px: Floats, measured_px: Floats, sigma_px: Floats, shape: tuple[int, int]
+    predicted_px: Floats, measured_px: Floats, sigma_px: Floats, shape: tuple[int, ...]
 ) -> tuple[int, Floats] | None:
     """
     First row after lost lines, about, and the offset (2,) of those below, px; None without a jump.
@@ -66,10 +66,8 @@ def find_line_loss(
     if not usable.any():
         return None
     rows, steps = rows[usable], below[:, usable].astype(np.float64)
-    u, v = ((predicted_px - np.array([width, height]) / 2.0) / (max(width, height) / 2.0)).T
-    smooth = polyvander2d(u, v, [degree, degree])
-    powers = np.arange(degree + 1)
-    smooth = smooth[:, np.add.outer(powers, powers).ravel() <= degree]
+    middle_px = np.array([width, height]) / 2.0
+    smooth = polynomial_terms((predicted_px - middle_px) / middle_px.max(), degree)
     root = 1.0 / np.hypot(sigma_px, _FLOOR_PX)
     weight = root
     for power in (0.5, 1.0, 1.0, 1.0):
@@ -165,8 +163,7 @@ def _alone_in_part(
     gone = seen & ((refusal == StarRefusal.NOT_DETECTED) | (refusal == StarRefusal.AMBIGUOUS))
     if np.count_nonzero(gone) < _FEWEST - 1:
         return np.zeros_like(kept)
-    height, width = shape
-    part = part_of(predicted_px, width, height)
+    part = part_of(predicted_px, shape)
     found = np.bincount(part[seen & kept], minlength=PARTS)
     shown = found + np.bincount(part[gone], minlength=PARTS)
     if not missed_parts(shown, found).any():

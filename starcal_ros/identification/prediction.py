@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import math
 
 import numpy as np
+from numpy.polynomial.polynomial import polyvander2d
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -76,7 +77,7 @@ def predict(
     with np.errstate(invalid='ignore'):
         # Far outside the image the distortion polynomial folds over: keep only the stars whose
         # pixel maps back to their direction.
-        near = in_image(xy_px, camera.width, camera.height, margin_px)
+        near = in_image(xy_px, camera, margin_px)
     near[near] &= np.einsum(
         'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
     ) > np.cos(1e-6)
@@ -130,10 +131,10 @@ def visible(
     return index[high], direction_icrf[high]
 
 
-def in_image(xy_px: Floats, width: int, height: int, margin_px: float = 0.0) -> Mask:
+def in_image(xy_px: Floats, camera: CameraModel, margin_px: float = 0.0) -> Mask:
     """Mask (n,) of the pixels (n, 2) inside the image widened by a margin."""
     u, v, m = xy_px[:, 0], xy_px[:, 1], margin_px
-    return (u > -m) & (u < width - 1 + m) & (v > -m) & (v < height - 1 + m)
+    return (u > -m) & (u < camera.width - 1 + m) & (v > -m) & (v < camera.height - 1 + m)
 
 
 def window_area(camera: CameraModel, margin_px: float) -> float:
@@ -141,15 +142,16 @@ def window_area(camera: CameraModel, margin_px: float) -> float:
     return (1.0 + 2.0 * margin_px / camera.width) * (1.0 + 2.0 * margin_px / camera.height)
 
 
-def within_image(prediction: Prediction, width: int, height: int) -> Prediction:
-    """Predicted stars inside the image."""
-    return prediction.select(in_image(prediction.xy_px, width, height))
+def warp_degree(n: int) -> int:
+    """Degree of the correction in u and v that n stars support."""
+    return 5 if n >= 150 else 3 if n >= 36 else 1 if n >= 12 else 0
 
 
-def warp_powers(n: int) -> list[tuple[int, int]]:
-    """Exponents (i, j) of u^i v^j in the correction for n stars."""
-    degree = 5 if n >= 150 else 3 if n >= 36 else 1 if n >= 12 else 0
-    return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+def polynomial_terms(uv: Floats, degree: int) -> Floats:
+    """Products (n, t) of powers of u and v (n, 2) whose exponents add up to the degree at most."""
+    i, j = np.indices((degree + 1, degree + 1)).reshape(2, -1)
+    u, v = uv.T
+    return np.asarray(polyvander2d(u, v, [degree, degree])[:, i + j <= degree])
 
 
 def fit_warp(
@@ -162,34 +164,29 @@ def fit_warp(
     It absorbs a distortion that the prior lacks, serves the search only and enters no observation.
     """
     n = len(predicted_px)
-    powers = warp_powers(n)
 
-    def basis(xy: Floats) -> Floats:
-        u, v = ((xy - half_px) / half_px).T
-        u_power, v_power = [np.ones_like(u)], [np.ones_like(v)]
-        for _ in range(max(i for i, _ in powers)):
-            u_power.append(u_power[-1] * u)
-            v_power.append(v_power[-1] * v)
-        return np.stack([u_power[i] * v_power[j] for i, j in powers])
+    def terms(xy_px: Floats) -> Floats:
+        return polynomial_terms((xy_px - half_px) / half_px, warp_degree(n))
 
-    A = basis(predicted_px)
+    A = terms(predicted_px)
     residual = measured_px - predicted_px
-    coefficients = medians(residual)[None] * (np.arange(len(powers)) == 0)[:, None]
+    coefficients: Floats = np.zeros((A.shape[1], 2))
+    coefficients[0] = medians(residual)
     scatter = 1.0
     for _ in range(8):
-        left = residual - A.T @ coefficients
+        left = residual - A @ coefficients
         size = np.hypot(left[:, 0], left[:, 1])
         before = scatter
         scatter = max(median(size) * RAYLEIGH_TO_SIGMA, 0.01)
         spread2 = sigma_px**2 + scatter**2
         weight = 1.0 / spread2 / (1.0 + size**2 / (9.0 * spread2)) ** 2
-        weighted = A * weight
-        normal = weighted @ A.T
+        weighted = A.T * weight
+        normal = weighted @ A
         # Powers up to 5 on -1 to 1 keep ten digits of the normal matrix; the damping bounds the
         # correction in corners without stars.
         normal.flat[:: len(normal) + 1] *= 1.0 + 1e-9
-        coefficients = np.linalg.solve(normal, weighted @ residual)
+        coefficients = np.asarray(np.linalg.solve(normal, weighted @ residual))
         if abs(scatter - before) < 0.03 * scatter:
             break
-    at = A if at_px is predicted_px else basis(at_px)
-    return at.T @ coefficients, scatter
+    at = A if at_px is predicted_px else terms(at_px)
+    return at @ coefficients, scatter

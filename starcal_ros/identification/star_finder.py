@@ -32,7 +32,6 @@ from starcal_ros.identification.prediction import (
     Prediction,
     SPACE,
     window_area,
-    within_image,
 )
 from starcal_ros.options import option
 from starcal_ros.records import CameraGeometry, Image, StarObservations, StarRefusal
@@ -154,20 +153,11 @@ def observe_stars(
     Raises ImageRefused ``no_stars``, ``smeared``, ``no_match``, ``not_in_catalog`` or
     ``incomplete``.
     """
-    image, options = exposure.image, search.identification
+    image = exposure.image
     background = detection.measure_background(image.pixels)
-    prediction = predict(
-        geometry,
-        exposure.icrf_from_star_tracker_xyzw,
-        image.time_ns,
-        search.catalog,
-        options.magnitude_limit,
-        search.reach_rad(geometry.camera)[0],
-        exposure.velocity.m_s,
-        exposure.site,
-    )
+    prediction = predicted(exposure, geometry, search, search.reach_rad(geometry.camera)[0])
     _check_catalog(prediction, exposure, geometry, search)
-    predicted_px, sources, streak = _find(image.pixels, background, prediction, geometry, search)
+    predicted_px, sources, streak = _find(image.pixels, background, prediction, search)
     # Cosmic rays and hot pixels may be brighter than the stars, and are sharper: the median of the
     # sources bears some, not most.
     off_px, _ = cKDTree(np.nan_to_num(predicted_px, nan=-1e6)).query(sources.xy_px)
@@ -183,6 +173,22 @@ def observe_stars(
         model = model_image(image.pixels, background, sources, search.centroid, streak)
     prediction = dataclasses.replace(prediction, xy_px=predicted_px)
     return measure_predicted(exposure, prediction, model, None, search)
+
+
+def predicted(
+    exposure: Exposure, geometry: CameraGeometry, search: StarSearch, margin_rad: float
+) -> Prediction:
+    """Catalog stars in an image and up to a margin outside of it, by its attitude."""
+    return predict(
+        geometry,
+        exposure.icrf_from_star_tracker_xyzw,
+        exposure.image.time_ns,
+        search.catalog,
+        search.identification.magnitude_limit,
+        margin_rad,
+        exposure.velocity.m_s,
+        exposure.site,
+    )
 
 
 def measure_predicted(
@@ -205,8 +211,7 @@ def measure_predicted(
     """
     catalog, options = search.catalog, search.identification
     pixels, hot_pixels = exposure.image.pixels, exposure.hot_pixels
-    height, width = pixels.shape
-    shown = within_image(prediction, width, height)
+    shown = prediction.select(in_image(prediction.xy_px, prediction.camera))
     least_snr = search.centroid.min_snr
     count = detection.detectable_count(pixels, shown.xy_px, model.background, least_snr)
     looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
@@ -229,12 +234,12 @@ def measure_predicted(
         exposure.site,
     )
     centroids, alone = separate(shown, catalog, faint, model, deeper)
-    _refuse_line_loss(shown.xy_px, centroids, (height, width))
+    _refuse_line_loss(shown.xy_px, centroids, pixels.shape)
     refusal = refuse_on_hot_pixels(
         shown.xy_px,
-        _refuse_displaced(shown.xy_px, centroids, width),
+        _refuse_displaced(shown, centroids),
         hot_pixels,
-        width,
+        shown.camera.width,
         stamp_radius_px(model.psf_sigma_px or 1.0, model.longest_streak_px),
         model.blurred_px,
     )
@@ -380,7 +385,6 @@ def _find(
     pixels: Pixels,
     background: detection.Background,
     prediction: Prediction,
-    geometry: CameraGeometry,
     search: StarSearch,
 ) -> tuple[Floats, detection.Sources, Streak | None]:
     """
@@ -391,15 +395,15 @@ def _find(
 
     Raises ImageRefused ``no_stars``, ``smeared`` or ``no_match``.
     """
-    camera = geometry.camera
-    inside = in_image(prediction.xy_px, camera.width, camera.height)
+    camera = prediction.camera
+    inside = in_image(prediction.xy_px, camera)
     near = detection.detect_near(
         pixels, background, prediction.xy_px[inside][:_NEAREST], SEARCH_RADIUS_PX
     )
     try:
         reach_px = float(SEARCH_RADIUS_PX)
         near, streak = without_streaks(pixels, background, near, camera)
-        matched_px = acquire(prediction, near, geometry, reach_px, _NEAREST_ROLL_RAD)
+        matched_px = acquire(prediction, near, reach_px, _NEAREST_ROLL_RAD)
         return matched_px, near, streak
     except ImageRefused:
         pass
@@ -412,10 +416,10 @@ def _find(
         )
     tilt_rad, roll_rad = search.reach_rad(camera)
     reach_px = tilt_rad * float(camera.parameters[0])
-    return acquire(prediction, sources, geometry, reach_px, roll_rad), sources, streak
+    return acquire(prediction, sources, reach_px, roll_rad), sources, streak
 
 
-def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) -> NDArray[np.uint8]:
+def _refuse_displaced(prediction: Prediction, centroids: Centroids) -> NDArray[np.uint8]:
     """
     Refusal reasons (n,) of the centroids, with displaced stars as ``ambiguous``.
 
@@ -425,16 +429,17 @@ def _refuse_displaced(predicted_px: Floats, centroids: Centroids, width: int) ->
     good = np.nonzero(refusal == StarRefusal.NONE)[0]
     if len(good) < 4:
         return refusal
-    expected_px, measured_px = predicted_px[good], centroids.xy_px[good]
+    expected_px, measured_px = prediction.xy_px[good], centroids.xy_px[good]
     sigma_px = centroids.sigma_px[good]
-    correction, scatter_px = fit_warp(expected_px, measured_px, sigma_px, expected_px, 0.5 * width)
+    half_px = 0.5 * prediction.camera.width
+    correction, scatter_px = fit_warp(expected_px, measured_px, sigma_px, expected_px, half_px)
     off_px = np.hypot(*(measured_px - expected_px - correction).T)
     limit_px = np.maximum(5.0 * np.hypot(sigma_px, 0.75 * scatter_px), 0.3)
     refusal[good[off_px > np.minimum(limit_px, 2.0)]] = StarRefusal.AMBIGUOUS
     return refusal
 
 
-def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[int, int]) -> None:
+def _refuse_line_loss(predicted_px: Floats, centroids: Centroids, shape: tuple[int, ...]) -> None:
     """
     Refuse an image with lost lines.
 

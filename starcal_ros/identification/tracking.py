@@ -18,25 +18,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import pdtrc
 
-from starcal_ros.arrays import Floats, Mask, Pixels
-from starcal_ros.camera import (
-    CameraModel,
-    field_radius_rad,
-    project,
-    project_jacobians,
-    rotation_jacobian,
-)
+from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.camera import CameraModel, project, project_jacobians, rotation_jacobian
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.prediction import Prediction, visible
+from starcal_ros.identification.prediction import Prediction
 from starcal_ros.identification.star_finder import (
     Exposure,
     measure_predicted,
+    predicted,
     SEARCH_RADIUS_PX,
     StarSearch,
 )
 from starcal_ros.records import CameraGeometry, StarObservations
 from starcal_ros.robust_statistics import median
-from starcal_ros.sky.catalog import cone
 from starcal_ros.stars import detection
 from starcal_ros.stars.image_model import Instrument, known_model
 
@@ -44,7 +38,6 @@ _GUIDES = 24  # brightest predictions, searched in windows
 _NEIGHBOUR_PX = 3.0  # offsets of all guides agree to this under a roll of 0.1 degrees
 _MAX_P_VALUE = 1e-9  # p-value of the matches in the windows, given a wrong prediction
 _GOOD_SNR = 10.0  # smallest signal-to-noise ratio of stars that correct the prediction
-_STEADY_PX = 1.0  # smaller rotations are left to the search in the next image
 _SYSTEMATIC_PX = 0.15  # rms from which the camera of the prediction is corrected
 # 1-sigma of the predicting camera about the one before: intrinsics as parts of the focal length,
 # and distortion for a lens with an inaccurate prior.
@@ -56,14 +49,13 @@ _SMALL_SIGMA = 1e-3  # 1-sigma of the other coefficients: decentring, thin prism
 @dataclass(frozen=True)
 class TrackedCamera:
     """
-    State of a track: geometry, field radius and PSF from the images so far.
+    State of a track: geometry and PSF from the images so far.
 
     ``geometry`` predicts the next image; its camera may differ from the prior of the calibration,
     because it only has to predict the windows.
     """
 
     geometry: CameraGeometry
-    field_radius_rad: float
     instrument: Instrument
 
 
@@ -77,8 +69,7 @@ def start_tracking(
     """
     if observations.refusal or instrument is None:
         return None
-    corrected = _corrected(geometry, observations)
-    return TrackedCamera(corrected, field_radius_rad(corrected.camera), instrument)
+    return TrackedCamera(_corrected(geometry, observations), instrument)
 
 
 def track_stars(
@@ -91,53 +82,27 @@ def track_stars(
     ``smeared``.
     """
     pixels = exposure.image.pixels
-    prediction = _predict(exposure, before, search)
+    camera = before.geometry.camera
+    margin_rad = SEARCH_RADIUS_PX / float(camera.parameters[0])
+    prediction = predicted(exposure, before.geometry, search, margin_rad)
     # The moment method needs the local background; a PSF fit estimates its own level.
     fitted = search.centroid.centroid == 'psf'
     background = (
         detection.sample_background(pixels) if fitted else detection.measure_background(pixels)
     )
-    rotation_rad = _find_rotation(pixels, background, prediction, before.geometry.camera)
+    rotation_rad = _find_rotation(pixels, background, prediction, camera)
     rotation = Rotation.from_rotvec(-rotation_rad)
     direction_camera = rotation.apply(prediction.direction_camera)
-    prediction = dataclasses.replace(
-        prediction,
-        direction_camera=direction_camera,
-        xy_px=project(before.geometry.camera, direction_camera),
-    )
+    xy_px = project(camera, direction_camera)
+    prediction = dataclasses.replace(prediction, direction_camera=direction_camera, xy_px=xy_px)
     model = known_model(pixels, background, before.instrument, prediction.xy_px, search.centroid)
     observations, instrument = measure_predicted(
         exposure, prediction, model, before.instrument, search
     )
     if observations.refusal:
         raise ImageRefused(observations.refusal, observations.detail)
-    instrument = instrument or before.instrument
-    rotation_px = rotation.magnitude() * prediction.px_per_rad
-    if rotation_px < _STEADY_PX and _fits(before.geometry, rotation, observations):
-        return observations, dataclasses.replace(before, instrument=instrument)
     corrected = _corrected(before.geometry, observations)
-    radius_rad = before.field_radius_rad
-    if corrected.camera is not before.geometry.camera:
-        radius_rad = field_radius_rad(corrected.camera)
-    return observations, TrackedCamera(corrected, radius_rad, instrument)
-
-
-def _predict(exposure: Exposure, before: TrackedCamera, search: StarSearch) -> Prediction:
-    """Apparent catalog stars in the field, brightest first."""
-    camera = before.geometry.camera
-    attitude = before.geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw)
-    icrf_from_camera = attitude.as_matrix()
-    # The catalog, and so the rows of a cone, are sorted by magnitude.
-    catalog, limit = search.catalog, search.identification.magnitude_limit
-    index = cone(catalog, icrf_from_camera[:, 2], before.field_radius_rad, limit)
-    index, direction_icrf = visible(
-        catalog, index, exposure.image.time_ns, exposure.velocity.m_s, exposure.site
-    )
-    direction_camera = direction_icrf @ icrf_from_camera
-    # Outside the field the distortion polynomial may fold back into the image.
-    near = direction_camera[:, 2] > np.cos(before.field_radius_rad + 2e-3)
-    xy_px = project(camera, direction_camera)
-    return Prediction(index, direction_icrf, direction_camera, xy_px, camera).select(near)
+    return observations, TrackedCamera(corrected, instrument or before.instrument)
 
 
 def _find_rotation(
@@ -186,23 +151,14 @@ def _find_rotation(
     return np.asarray(rotation_rad)
 
 
-def _fits(geometry: CameraGeometry, rotation: Rotation, observations: StarObservations) -> bool:
-    """Return True if the rotated camera predicts the stars within the systematic limit."""
-    bright = _bright(observations)
-    attitude = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
-    camera_from_icrf = rotation * attitude.inv()
-    directions = observations.direction_icrf[bright] @ camera_from_icrf.as_matrix().T
-    off_px = observations.measured_px[bright] - project(geometry.camera, directions)
-    return _rms_px(off_px) < _SYSTEMATIC_PX
-
-
 def _corrected(geometry: CameraGeometry, observations: StarObservations) -> CameraGeometry:
     """Geometry aligned to the stars of an image; its camera is corrected if it does not fit."""
     camera = geometry.camera
     icrf_from_camera = geometry.icrf_from_camera(observations.icrf_from_star_tracker_xyzw)
     directions = observations.direction_icrf @ icrf_from_camera.as_matrix()
     variance_px2 = 0.5 * (observations.covariance_px2[:, 0] + observations.covariance_px2[:, 2])
-    bright = _bright(observations)
+    bright = observations.snr > _GOOD_SNR
+    bright |= np.count_nonzero(bright) < 4
     directions, measured_px = directions[bright], observations.measured_px[bright]
     # A prediction need not be better than 0.05 px.
     weight = 1.0 / (variance_px2[bright] + 0.05**2)
@@ -216,12 +172,6 @@ def _corrected(geometry: CameraGeometry, observations: StarObservations) -> Came
     icrf_from_star_tracker = Rotation.from_quat(observations.icrf_from_star_tracker_xyzw)
     camera_from_star_tracker = rotation * icrf_from_camera.inv() * icrf_from_star_tracker
     return CameraGeometry(camera, camera_from_star_tracker.inv().as_quat())
-
-
-def _bright(observations: StarObservations) -> Mask:
-    """Mask (n,) of the stars that correct a prediction; all if too few are bright."""
-    bright = observations.snr > _GOOD_SNR
-    return np.asarray(bright | (np.count_nonzero(bright) < 4))
 
 
 def _rms_px(off_px: Floats) -> float:

@@ -24,7 +24,7 @@ from starcal_ros.assessment.model_checks import model_checks
 from starcal_ros.assessment.stated import check_statements, with_doubts
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
-from starcal_ros.camera.projection import convert, ros_fit
+from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
@@ -208,7 +208,7 @@ def _not_judged(
         misfit_images_ns=tuple(np.array(stamps_ns)[result.misfit_image].tolist()),
         singular_values=tuple(float(value) for value in singular_values),
         weakest_direction=weakest,
-        zero_skew_cost_px=ros_fit(camera)[1],
+        zero_skew_cost_px=camera.ros_fit[1],
         iterations=result.iterations,
         termination=result.termination,
         accepted=False,

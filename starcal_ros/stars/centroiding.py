@@ -30,7 +30,7 @@ from starcal_ros.stars.image_model import (
     Instrument,
     MAX_SHAPE_CHANGE,
     PsfWidth,
-    SHOWN_SNR,
+    showing_psf,
     width_basis,
 )
 from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
@@ -136,7 +136,7 @@ def _measure_by_psf(
         predicted_px,
         centre,
         inside & (windows.saturated_pixels == 0),
-        model.pixel_noise,
+        model,
     )
     # Most stars of the catalog are too faint: their refusal needs no covariance and no shape.
     faint = psf_fit.surely_fainter(stamps, parameters, done, options.min_snr, model.pixel_noise)
@@ -147,13 +147,11 @@ def _measure_by_psf(
     snr[fitted], misshapen[fitted] = fit.snr, _misshapen(fit, model)
     covariance_px2 = np.full((len(faint), 3), np.nan)
     covariance_px2[fitted] = fit.covariance[:, [0, 0, 1], [0, 1, 1]]
-    # The brightest pixel is anywhere along a streak.
-    in_place_px = _IN_PLACE_PX + model.extent_px - (model.psf_sigma_px or 1.0)
     refusal = _first_reason(
         (~inside, StarRefusal.BORDER),
         (windows.saturated_pixels > options.max_saturated_pixels, StarRefusal.SATURATED),
         ((snr < options.min_snr) | ~np.isfinite(snr), StarRefusal.FAINT),
-        (np.maximum(*np.abs(parameters[:, :2].T)) > in_place_px, StarRefusal.NOT_DETECTED),
+        (~_in_place(parameters, model), StarRefusal.NOT_DETECTED),
         (misshapen, StarRefusal.ELONGATED),
     )
     xy_px = centre + parameters[:, :2]
@@ -173,12 +171,15 @@ def _measure_by_psf(
     )
 
 
+def _in_place(parameters: Floats, model: ImageModel) -> Mask:
+    """Mask (n,) of the fits (n, 4) that end at the brightest pixel, anywhere along a streak."""
+    reach_px = _IN_PLACE_PX + model.extent_px - (model.psf_sigma_px or 1.0)
+    return np.asarray(np.maximum(*np.abs(parameters[:, :2].T)) < reach_px)
+
+
 def _first_reason(*reasons: tuple[Mask, StarRefusal]) -> NDArray[np.uint8]:
     """Codes (n,) of the first of the reasons whose mask (n,) holds; 0 without any."""
-    codes = np.zeros(len(reasons[0][0]), np.uint8)
-    for mask, code in reversed(reasons):
-        codes[mask] = code
-    return codes
+    return np.select(*zip(*reasons, strict=True)).astype(np.uint8)
 
 
 def _brightest_beside(
@@ -285,15 +286,13 @@ def shape_changed(measured: Centroids, model: ImageModel) -> bool:
     """Return True if most bright stars have another shape than the model: streaks, or defocus."""
     if measured.fit is None:
         return False
-    # Few stars of a narrow field are bright, and light spread along streaks has more noise.
-    for least_snr in (BRIGHT_SNR, SHOWN_SNR):
-        shown = measured.fit.snr > least_snr
-        change = measured.fit.shape_change[shown]
-        if len(change) >= FEWEST_BRIGHT:
-            noise = _OF_MEDIAN * medians(measured.fit.shape_sigma[shown]) / math.sqrt(len(change))
-            departure = np.abs(medians(change) - model.shape_median)
-            return bool((departure > np.maximum(_COMMON_CHANGE, 4.0 * noise)).any())
-    return False
+    shown = showing_psf(measured.fit.snr)
+    change = measured.fit.shape_change[shown]
+    if len(change) < FEWEST_BRIGHT:
+        return False
+    noise = _OF_MEDIAN * medians(measured.fit.shape_sigma[shown]) / math.sqrt(len(change))
+    departure = np.abs(medians(change) - model.shape_median)
+    return bool((departure > np.maximum(_COMMON_CHANGE, 4.0 * noise)).any())
 
 
 def _without_neighbours(
@@ -303,21 +302,19 @@ def _without_neighbours(
     predicted_px: Floats,
     centre: Indices,
     usable: Mask,
-    noise: PixelNoise,
+    model: ImageModel,
 ) -> tuple[psf_fit.Stamps, Floats, Mask, Mask]:
     """
     Stamps without the light of the neighbours that can be modelled.
 
     Also what `psf_fit.approach` finds in them, and a mask (n,) of the modelled stars.
     """
-    flux, sigma_px = parameters[:, 2], stamps.sigma_px
+    flux, sigma_px, noise = parameters[:, 2], stamps.sigma_px, model.pixel_noise
     streak_px = psf_fit.longest_px(stamps.streak_px)
     blurred = blurred_px(sigma_px, streak_px)
     snr = expected_snr(flux, blurred, np.sqrt(stamps.noise2_dn2[:, 0]), noise)
     widest_px = float(sigma_px.max(initial=0.0))
-    in_place_px = _IN_PLACE_PX + math.hypot(widest_px, streak_px / math.sqrt(12.0)) - widest_px
-    in_place = np.maximum(*np.abs(parameters[:, :2].T)) < in_place_px
-    modelled = usable & (snr > _MODELLED_SNR) & in_place
+    modelled = usable & (snr > _MODELLED_SNR) & _in_place(parameters, model)
     if len(stamps) < 2:
         return stamps, parameters, done, modelled
     # The wing of a star outside the stamp adds light to it.
@@ -493,11 +490,7 @@ def learn(
     # The lens changes the shape of all stars alike; this is not the noise of a pixel.
     plain = stars[measured.fit.worst_pixel_sigma[stars] <= psf_fit.MISFIT_SIGMA]
     stars = plain if len(plain) >= FEWEST_BRIGHT else stars
-    # Few stars of a narrow field are bright.
-    for least_snr in (BRIGHT_SNR, SHOWN_SNR):
-        bright = stars[measured.fit.snr[stars] > least_snr][:_MOST]
-        if len(bright) >= FEWEST_BRIGHT:
-            break
+    bright = stars[showing_psf(measured.fit.snr[stars])][:_MOST]
     # Fainter stars show no PSF error, so that it can be separated from photon noise.
     shown = stars[:_MOST]
     noise = psf_fit.noise_sums(

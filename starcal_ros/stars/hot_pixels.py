@@ -22,7 +22,7 @@ from starcal_ros.stars.pixel_noise import quantisation_step_dn, rounding_noise_d
 
 _SCANNED_PX = 1 << 19  # pixels scanned per image, in 0.1 ms; larger images are scanned by strips
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
-SPILT = 0.2  # mean of the four adjacent pixels over the peak: 0.24 for a star of 0.45 px
+_SPILT = 0.2  # mean of the four adjacent pixels over the peak: 0.24 for a star of 0.45 px
 _BESIDE = np.array([[1, -1, 0, 0], [0, 0, 1, -1]])[:, :, None]  # offsets in rows and columns
 CORE_PX = 1.5  # a hot pixel this near spoils the peak of a star
 _WIDE_PSF_PX = 1.5  # each pixel of such a star has under 7 % of its light: the fit can omit one
@@ -121,11 +121,13 @@ def _single_lit(
     return np.asarray((v * width + u)[single][:_MOST], np.int64)
 
 
-def lit_alone(pixels: Pixels, v: Indices, u: Indices, background_dn: float | Floats) -> Mask:
+def lit_alone(
+    pixels: Pixels | Floats, v: Indices, u: Indices, background_dn: float | Floats
+) -> Mask:
     """Mask (k,) of pixels, none at the rim, with less light beside them than a star has."""
     beside = pixels[v + _BESIDE[0], u + _BESIDE[1]].sum(axis=0, dtype=np.float64)
     peak = pixels[v, u] - background_dn
-    return np.asarray(0.25 * beside - background_dn < SPILT * peak)
+    return np.asarray(0.25 * beside - background_dn < _SPILT * peak)
 
 
 def hot_in_stamps(hot: Indices, centre: Indices, radius: int, width: int) -> Mask:

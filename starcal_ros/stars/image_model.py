@@ -16,7 +16,7 @@ import math
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Pixels
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels
 from starcal_ros.options import option
 from starcal_ros.robust_statistics import centre_and_scatter, median
 from starcal_ros.stars import detection
@@ -176,6 +176,13 @@ class ImageModel:
     def streaks_at(self, xy_px: Floats | Indices) -> Floats | None:
         """Paths (n, 2), px, of stars at pixels (n, 2) during the exposure; None: sharp."""
         return self.streak.at(xy_px) if self.streak else None
+
+
+def showing_psf(snr: Floats) -> Mask:
+    """Mask (n,) of the stars that show the PSF, by their signal-to-noise ratio (n,)."""
+    bright = snr > BRIGHT_SNR
+    # Few stars of a narrow field are bright, and light spread along streaks has more noise.
+    return bright if np.count_nonzero(bright) >= FEWEST_BRIGHT else snr > SHOWN_SNR
 
 
 def saturation_level(pixels: Pixels, options: CentroidOptions, step_dn: int) -> float:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.special import erf, ndtr
 
 from starcal_ros.arrays import Floats, Mask, rows_of
-from starcal_ros.stars.hot_pixels import CORE_PX, SPILT
+from starcal_ros.stars.hot_pixels import CORE_PX, lit_alone
 from starcal_ros.stars.pixel_noise import blurred_px, expected_snr, NoiseSums, PixelNoise
 
 _FIT_STEPS = 4  # stars converge in two or three; other sources may not
@@ -42,9 +42,8 @@ class PsfFit:
     ``shape_change`` and ``shape_sigma`` (n, 3): departure of the second moments xx, yy, xy from
     those of the PSF as a fraction of its variance, and its 1-sigma.
     ``signal_dn``, ``residual_dn`` and ``sigma_dn`` (n, p): light of the star in each pixel of its
-    stamp, residual of the fit and 1-sigma of the noise, NaN for excluded pixels.  ``derivatives``
-    (n, 4, p) by the parameters, over the noise of each pixel, and ``noise_covariance`` (n, 4, 4),
-    without the error of the PSF.
+    stamp, residual of the fit and 1-sigma of the noise, NaN for excluded pixels.
+    ``leverage`` (n, p): part of the noise of a pixel that the fit follows.
     """
 
     parameters: Floats
@@ -56,8 +55,7 @@ class PsfFit:
     signal_dn: Floats
     residual_dn: Floats
     sigma_dn: Floats
-    derivatives: Floats
-    noise_covariance: Floats
+    leverage: Floats
 
 
 def stamp_radius_px(psf_sigma_px: float, streak_px: float = 0.0) -> int:
@@ -218,7 +216,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     of_shape = np.linalg.solve(normal, np.broadcast_to(np.eye(7)[:, 4:], (len(normal), 7, 3)))
     shape_step = (gradient[:, None, :] @ of_shape)[:, 0]
     shape_variance = of_shape[:, [4, 5, 6], [0, 1, 2]]
-    noise_covariance = covariance
+    leverage = np.einsum('nkp,nkp->np', covariance @ rows[:, :4], rows[:, :4])
     parameters = parameters + last
     snr = parameters[:, 2] / np.sqrt(covariance[:, 2, 2])
     excess: Floats | float = 0.0
@@ -242,8 +240,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
         signal_dn=light,
         residual_dn=residual_dn,
         sigma_dn=sigma_dn,
-        derivatives=rows[:, :4],
-        noise_covariance=noise_covariance,
+        leverage=leverage,
     )
 
 
@@ -269,15 +266,13 @@ def _single_misfits(
     v, u = np.divmod(pixel, width)
     x, y = parameters[star, :2].T + width // 2
     away = np.hypot(u - x, v - y) > CORE_PX
-    if not away.any():
-        return star[away], pixel[away]
     star, pixel, v, u = star[away], pixel[away], v[away], u[away]
-    rimmed = np.zeros((len(star), width + 2, width + 2))
     left_dn = stamps.flat_dn[star] - light[star] - parameters[star, 3, None]
+    # Dark rims: the stamps lie below each other.
+    rimmed = np.zeros((len(star), width + 2, width + 2))
     rimmed[:, 1:-1, 1:-1] = left_dn.reshape(-1, width, width)
-    row = np.arange(len(star))
-    beside = sum(rimmed[row, v + b, u + a] for b, a in ((0, 1), (2, 1), (1, 0), (1, 2)))
-    alone = 0.25 * beside < SPILT * left_dn[row, pixel]
+    row = np.arange(len(star)) * (width + 2)
+    alone = lit_alone(rimmed.reshape(-1, width + 2), row + v + 1, u + 1, 0.0)
     return star[alone], pixel[alone]
 
 
@@ -370,9 +365,7 @@ def noise_sums(fit: PsfFit, noise_dn: Floats, expected: PixelNoise) -> NoiseSums
     signal = np.maximum(fit.signal_dn, 0.0)
     flux = np.maximum(fit.parameters[:, 2, None], 0.0)
     variance = expected.variance(signal, noise_dn[:, None], flux)
-    moved = fit.noise_covariance @ fit.derivatives
-    leverage = np.einsum('nkp,nkp->np', moved, fit.derivatives)
-    squared = fit.residual_dn**2 / np.maximum(1.0 - leverage, 0.05)
+    squared = fit.residual_dn**2 / np.maximum(1.0 - fit.leverage, 0.05)
     # The comparison is false for NaN, an excluded pixel.
     keep = squared < 25.0 * variance
     weight = keep / variance

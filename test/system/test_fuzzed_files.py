@@ -23,7 +23,6 @@ from starcal_ground.products import prior_of
 from starcal_ground.written_files import write_calibration
 from starcal_ros.assessment.lookup import line_of_sight_table
 from starcal_ros.camera import field_radius_rad, line_of_sight, pixel_grid, project
-from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
@@ -74,7 +73,7 @@ def test_camera_files(tmp_path) -> None:
         camera = read_camera_info(path)
         project(camera, line_of_sight(camera, pixel_grid(camera, 5, 5)))
         field_radius_rad(camera)
-        ros_fit(camera)
+        assert camera.ros_fit[1] >= 0.0
 
     spoils((BAG / 'camera.yaml').read_text(), tmp_path / 'camera.yaml', read)
 

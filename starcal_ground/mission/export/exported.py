@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
-from starcal_ros.camera.projection import nearest_camera
+from starcal_ros.camera.projection import convert
 from starcal_ros.constants import utc_text
 from starcal_ros.records import Calibration
 
@@ -62,16 +62,16 @@ def fitted(
     see the whole detector.
     """
     camera = calibration.geometry.camera
-    nearest, worst_px = nearest_camera(camera, model, zero)
+    nearest, worst_px = convert(camera, model, zero)
     losses = []
     lens = replace(camera, field=None)
-    if camera.has_field:
+    if camera.moving_field is not None:
         losses.append(Loss('field beside the lens model', _alone(camera, camera.model, ())))
     if not camera.has_lens(model):
         cost_px = _alone(lens, model, ())
         if cost_px > 0:
             losses.append(Loss(f'lens model {camera.model} (here {model})', cost_px))
-        lens, _ = nearest_camera(lens, model, ())
+        lens, _ = convert(lens, model, ())
     losses += [
         Loss(name, _alone(lens, model, (name,)))
         for name in zero
@@ -81,7 +81,7 @@ def fitted(
 
 
 def _alone(camera: CameraModel, model: str, zero: tuple[str, ...]) -> float:
-    return nearest_camera(camera, model, zero)[1]
+    return convert(camera, model, zero)[1]
 
 
 def temperature_losses(calibration: Calibration) -> tuple[Loss, ...]:

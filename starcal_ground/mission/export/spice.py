@@ -233,7 +233,7 @@ def _lens_comments(camera: CameraModel, names: SpiceNames) -> list[str]:
         "   u = FOCAL_LENGTH_PX(1) x' + SKEW_PX y' + CCD_CENTER(1)",
         "   v = FOCAL_LENGTH_PX(2) y' + CCD_CENTER(2)",
     ]
-    if camera.has_field:
+    if camera.moving_field is not None:
         lines += [
             '',
             'A star that these equations place at (u, v) is measured at (U, V) with',

@@ -13,7 +13,6 @@ import numpy as np
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel
 from starcal_ros.camera.lens import ros_distortion
-from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.sensor_messages import refused_from_message
@@ -224,8 +223,8 @@ def active_from_message(message: codec.Message) -> Calibration | None:
 
 
 def camera_info_fields(camera: CameraModel) -> dict[str, Any]:
-    """Size, lens and matrices of a CameraInfo: the best camera without skew (`ros_fit`)."""
-    camera, _ = ros_fit(camera)
+    """Size, lens and matrices of a CameraInfo: the best camera without skew."""
+    camera, _ = camera.ros_fit
     fx, _, fy, cx, cy = camera.intrinsics
     distortion_model, D = ros_distortion(camera.model, camera.distortion)
     return {

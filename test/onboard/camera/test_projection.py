@@ -23,7 +23,7 @@ from starcal_ros.camera import (
     project_parameters,
 )
 from starcal_ros.camera.lens import fold_radius2, LENSES
-from starcal_ros.camera.projection import convert, ros_fit
+from starcal_ros.camera.projection import convert
 
 #                     fx     skew     fy     cx     cy     k1     k2     k3    p1     p2
 CAMERAS = {
@@ -312,7 +312,7 @@ def test_field_radius_of_a_camera_that_folds_over_is_finite() -> None:
 
 def test_without_skew_nothing_is_fitted() -> None:
     camera = CAMERAS['pinhole']
-    fitted, worst_px = ros_fit(camera)
+    fitted, worst_px = camera.ros_fit
     np.testing.assert_array_equal(fitted.parameters, camera.parameters)
     assert worst_px == 0.0
 
@@ -320,7 +320,7 @@ def test_without_skew_nothing_is_fitted() -> None:
 @pytest.mark.parametrize('skew', [0.5, 2.0, -4.0])
 def test_the_fit_without_skew_costs_no_more_than_the_shear_itself(skew: float) -> None:
     camera = CAMERAS['paper'].replace(skew=skew)
-    fitted, worst_px = ros_fit(camera)
+    fitted, worst_px = camera.ros_fit
     assert fitted.parameters[1] == 0.0
     # Dropped, skew leaves skew y', at most |skew| times half the height over the focal length.
     bound_px = abs(skew) * 1024 / 7286
@@ -332,7 +332,7 @@ def test_the_fit_without_skew_costs_no_more_than_the_shear_itself(skew: float) -
 
 def test_the_fit_without_skew_is_a_least_squares_minimum() -> None:
     camera = CAMERAS['pincushion']
-    fitted, _ = ros_fit(camera)
+    fitted, _ = camera.ros_fit
     pixels = pixel_grid(camera, 25, 25)
     e = line_of_sight(camera, pixels)
     base = ((project(fitted, e) - pixels) ** 2).sum()

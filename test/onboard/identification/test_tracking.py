@@ -185,16 +185,11 @@ def test_a_drifting_alignment_is_tracked() -> None:
     _, known = searched(0)
     first = known.geometry
     focal_px = PRIOR.camera.intrinsics[0]
-    kept = []
     for turned_px in np.arange(0.0, 4.0, 0.4):
-        before = known
         observations, known = followed(exposure(1, turned_px / focal_px), known)
         assert len(observations) > 0.95 * len(searched(1)[0])
-        kept.append(known.geometry is before.geometry)
-    # Under a pixel nothing is corrected, as the next image finds its turn anyway; beyond it is.
-    assert 4 <= kept.count(True) <= 8
-    # Of 3.6 px one may be left, and the star tracker's noise has turned the first image by 0.9.
-    assert abs(turn_between(first, known.geometry).magnitude() * focal_px - 3.6) < 2.0
+    # The star tracker's noise has turned the first image by 0.9 px.
+    assert abs(turn_between(first, known.geometry).magnitude() * focal_px - 3.6) < 1.0
 
 
 @pytest.mark.parametrize('turn_deg', [0.6, 1.5, 40.0])

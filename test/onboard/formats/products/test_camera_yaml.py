@@ -13,7 +13,6 @@ import yaml
 
 from starcal_ground.products import write_camera_info
 from starcal_ros.camera import CameraModel, project
-from starcal_ros.camera.projection import ros_fit
 from starcal_ros.errors import ProductError
 from starcal_ros.formats.products.camera_yaml import (
     read_camera_info,
@@ -52,7 +51,7 @@ projection_matrix:
 def test_camera_info_is_what_camera_info_manager_reads(tmp_path: Path) -> None:
     path = tmp_path / 'camera_info.yaml'
     write_camera_info(CAMERA, path, 'opnav')
-    fitted, _ = ros_fit(CAMERA)
+    fitted, _ = CAMERA.ros_fit
     fx, _, fy, cx, cy, k1, k2, k3, p1, p2 = fitted.parameters.tolist()
     P = [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0]
     expected = {
@@ -141,7 +140,7 @@ def test_skew_of_every_model_goes_out_as_the_best_fit(tmp_path, model, coefficie
     )
     write_camera_info(camera, tmp_path / 'camera.yaml')
     back = read_camera_info(tmp_path / 'camera.yaml')
-    fitted, worst_px = ros_fit(camera)
+    fitted, worst_px = camera.ros_fit
     assert back.model == model and back.parameters.tobytes() == fitted.parameters.tobytes()
     # Dropped, skew leaves at most skew y', half the height over the focal length; the least
     # squares may be worse in a corner.
