@@ -23,16 +23,15 @@ from starcal_ground.images.first_setup import Given, source_of
 from starcal_ground.images.image_series import FileFacts
 from starcal_ground.parameter_files import read_values
 from starcal_ground.products import inputs_of
+from starcal_ground.residuals import Residuals, solve_with_residuals
 from starcal_ground.source_diagnosis import calibrated
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions
-from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel
 from starcal_ros.errors import OptionError
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.formats.products import product_files
 from starcal_ros.options import names_of, unknown_option
-from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.record_fields import check_shape, fields_of, plain_record, read_record, read_value
 from starcal_ros.records import Calibration, CameraGeometry, StarObservations
@@ -224,7 +223,7 @@ def calibrate_with_residuals(
     # The caller has looked the stars up: the bundled catalog has no part in the result.
     none = dataclasses.replace(setup.catalog.select(slice(0)), digest='')
     setup, ensemble = dataclasses.replace(setup, catalog=none), campaign.ensemble_of(images, setup)
-    return solve.solve_with_residuals(ensemble, setup)
+    return solve_with_residuals(ensemble, setup)
 
 
 def calibrate_bag(

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.topics import OnImage, Topics, Wanted
-from starcal_ros.assessment.predictions import Residuals
+from starcal_ground.residuals import Residuals, solve_with_residuals
 from starcal_ros.assessment.requirements import REQUIREMENTS
 from starcal_ros.errors import OptionError
 from starcal_ros.pipeline import solve
@@ -227,7 +227,7 @@ def _measured_again(
 def _solved(observed: Observed, inputs: Mapping[str, str] | None) -> Campaign:
     setup, observations = observed.source.setup, _with_repeats(observed.observations)
     ensemble = ensemble_of(observations, setup)
-    calibration, residuals = solve.solve_with_residuals(ensemble, setup, inputs)
+    calibration, residuals = solve_with_residuals(ensemble, setup, inputs)
     notes = (*observed.notes, *_refusals(observations))
     return Campaign(setup, observations, ensemble, calibration, residuals, notes)
 

@@ -26,10 +26,10 @@ import yaml
 from starcal_ground import written_files
 from starcal_ground.bags import rosbag2
 from starcal_ground.bags.reader import OF_THE_STARS
+from starcal_ground.residuals import Residuals
 from starcal_ground.written_files import is_marked
 from starcal_ros import record_fields, untrusted
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, check_plausible
 from starcal_ros.errors import errors_as, OptionError, ProductError
 from starcal_ros.formats.messages.record_messages import camera_info_fields

@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.report import svg, verdict
+from starcal_ground.residuals import Residuals
 from starcal_ros import records
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import movement
-from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.camera import CameraModel, distortion_px, line_of_sight, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField
 from starcal_ros.text import significant

@@ -10,8 +10,8 @@ import math
 import numpy as np
 
 from starcal_ground.report import svg
+from starcal_ground.residuals import Residuals
 from starcal_ros.arrays import Floats
-from starcal_ros.assessment.predictions import Residuals
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.estimation.star_equations import whitening
 from starcal_ros.pipeline.annotation import predicted_px

@@ -24,7 +24,7 @@ from starcal_ground import products, written_files
 from starcal_ground.bags import reader
 from starcal_ground.report import detector_figures, figures, svg, thumbnails, verdict
 from starcal_ground.report.thumbnails import Thumbnail
-from starcal_ros.assessment.predictions import Residuals
+from starcal_ground.residuals import Residuals
 from starcal_ros.constants import ARCSECOND_RAD, utc_text
 from starcal_ros.errors import OptionError, ProductError
 from starcal_ros.formats.messages.message_codec import OBSERVATIONS_TYPE

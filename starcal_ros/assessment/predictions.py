@@ -1,6 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """
-Residuals, and predictions of images, stars and cells of the detector from all others.
+Predictions of images, stars and cells of the detector from all others.
 
 The estimate without image k is one linear step from the posterior at the most likely amplitudes.
 N is the information on the shared unknowns with their priors, M_k the part of image k with its own
@@ -19,109 +19,18 @@ and its sigmas hold, in every part of the data.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 import math
-from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from starcal_ros.arrays import Floats, Indices, Mask
-from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import star_rows
 from starcal_ros.estimation.levenberg_marquardt import inverse
 from starcal_ros.estimation.limits import FEWEST, NEGLIGIBLE
 from starcal_ros.estimation.shared_errors import pairs_of
-from starcal_ros.record_fields import Record, Shape, Within
-from starcal_ros.records import Ensemble, ResidualBin
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Residuals(Record):
-    """
-    Residuals of a calibration, m images in time order and n stars in image order.
-
-    Attributes
-    ----------
-    image_time_ns : (m,) int64
-    image_misfit : (m,) bool
-        Images whose attitude does not fit, or that lost their stars.
-    attitude_error_arcsec : (m, 3)
-        Error of the star tracker, from the stars of the image and the common alignment: the small
-        passive rotation about its own axes from the true to the reported attitude.  NaN if the
-        image has too few stars.
-    attitude_sigma_arcsec : (m, 3)
-        Its 1-sigma from the centroids, for a known camera.
-    image : (n,) int64
-        Index of the image of the star.
-    catalog_id : (n,) int64
-    magnitude, colour_bp_rp : (n,) float64
-        V and Gaia BP - RP; NaN if not in the catalog.
-    measured_px : (n, 2)
-    residual_px : (n, 2)
-        Measured minus predicted.
-    covariance_px2 : (n, 3)
-        uu, uv, vv of the centroids, as weighted in the final estimation.
-    used : (n,) bool
-        False for outliers and stars of images that were left out.
-    """
-
-    image_time_ns: Annotated[NDArray[np.int64], Shape(('m',))]
-    image_misfit: Annotated[NDArray[np.bool_], Shape(('m',))]
-    attitude_error_arcsec: Annotated[Floats, Shape(('m', 3))]
-    attitude_sigma_arcsec: Annotated[Floats, Shape(('m', 3))]
-    image: Annotated[NDArray[np.int64], Within(0), Shape(('n',))]
-    catalog_id: Annotated[NDArray[np.int64], Shape(('n',))]
-    magnitude: Annotated[Floats, Shape(('n',))]
-    colour_bp_rp: Annotated[Floats, Shape(('n',))]
-    measured_px: Annotated[Floats, Shape(('n', 2))]
-    residual_px: Annotated[Floats, Shape(('n', 2))]
-    covariance_px2: Annotated[Floats, Shape(('n', 3))]
-    used: Annotated[NDArray[np.bool_], Shape(('n',))]
-
-    def image_rms_px(self) -> Floats:
-        """RMS per axis (m,) over the used stars of each image; NaN if none is used."""
-        m = len(self.image_time_ns)
-        image = self.image[self.used]
-        squares = np.bincount(image, (self.residual_px[self.used] ** 2).mean(axis=1), m)
-        count = np.bincount(image, minlength=m)
-        mean: Floats = np.divide(squares, count, out=np.full(m, np.nan), where=count > 0)
-        return np.asarray(np.sqrt(mean))
-
-
-def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -> Residuals:
-    """
-    Residuals of an estimate.
-
-    Parameters
-    ----------
-    ensemble : Ensemble
-        Ensemble of the estimate.
-    colour_bp_rp : (n,)
-        Colours of the stars in the table of the estimate.
-    """
-    table, attitudes = estimate.table, estimate.attitudes
-    seen = attitudes.seen[:, None]
-    # The estimate has the opposite sign: from the reported to the true attitude.
-    error_arcsec = -attitudes.error_rad / ARCSECOND_RAD
-    sigma_rad = np.sqrt(np.einsum('mii->mi', attitudes.covariance_rad2))
-    return Residuals(
-        image_time_ns=np.array([image.time_ns for image in ensemble.images], np.int64),
-        image_misfit=estimate.misfit_image,
-        attitude_error_arcsec=np.where(seen, error_arcsec, np.nan),
-        attitude_sigma_arcsec=np.where(seen, sigma_rad / ARCSECOND_RAD, np.nan),
-        image=table.image,
-        catalog_id=table.catalog_id,
-        magnitude=np.concatenate([image.magnitude for image in ensemble.images]).astype(float),
-        colour_bp_rp=colour_bp_rp,
-        measured_px=table.measured_px,
-        residual_px=estimate.residual_px,
-        covariance_px2=estimate.covariance_px2,
-        used=estimate.kept,
-    )
-
+from starcal_ros.records import ResidualBin
 
 _BINS = 4  # quantiles of radius, magnitude and time: corners and faint stars are separate
 _FEWEST_STARS = 30  # the normalised residual of a bin is then accurate to 9 %

@@ -21,7 +21,6 @@ from starcal_ros.assessment import observability
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
-from starcal_ros.assessment.predictions import Residuals, residuals_of
 from starcal_ros.assessment.stated import check_statements, with_doubts
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
@@ -121,6 +120,7 @@ def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     return observability.ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
+@one_blas_thread()
 def solve(
     ensemble: Ensemble,
     setup: Setup,
@@ -134,24 +134,21 @@ def solve(
     change from ``active``, the calibration that this one would replace. Raises TooFewObservations
     when the ensemble is too small; the text names the shortage.
     """
-    return solve_with_residuals(ensemble, setup, inputs, active)[0]
+    setup = aligned_by(ensemble, setup)
+    return calibration_of(estimated(ensemble, setup), ensemble, setup, inputs, active)
 
 
-@one_blas_thread()
-def solve_with_residuals(
+def calibration_of(
+    result: Estimate,
     ensemble: Ensemble,
     setup: Setup,
     inputs: Mapping[str, str] | None = None,
     active: Calibration | None = None,
-) -> tuple[Calibration, Residuals]:
-    """The calibration of `solve`, and its residuals by star and image."""
-    setup = aligned_by(ensemble, setup)
-    result = estimated(ensemble, setup)
+) -> Calibration:
+    """The calibration of an estimate of an ensemble, as of `solve`."""
     provenance = provenance_of(setup, ensemble, inputs or {})
     calibration = _not_judged(result, ensemble, setup, provenance)
-    calibration = judged(calibration, ensemble, setup, active)
-    colour_bp_rp = setup.catalog.colours_bp_rp(result.table.catalog_id)
-    return calibration, residuals_of(result, ensemble, colour_bp_rp)
+    return judged(calibration, ensemble, setup, active)
 
 
 @one_blas_thread()
