@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -109,11 +109,18 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
 def solve_with_residuals(
     ensemble: Ensemble, setup: Setup, inputs: Mapping[str, str] | None = None
 ) -> tuple[Calibration, Residuals]:
-    """The calibration of `solve.solve`, and its residuals by star and image."""
+    """
+    The calibration of `solve.solve`, and its residuals by star and image.
+
+    ``inputs`` maps the names of the sources of the observations to their digests, for the
+    provenance.
+    """
     setup = aligned_by(ensemble, setup)
     found = estimated(ensemble, setup)
+    calibration = calibration_of(found, ensemble, setup)
+    sources = {f'input {name}': digest for name, digest in (inputs or {}).items()}
     colour_bp_rp = setup.catalog.colours_bp_rp(found.table.catalog_id)
     return (
-        calibration_of(found, ensemble, setup, inputs),
+        replace(calibration, provenance={**calibration.provenance, **sources}),
         residuals_of(found, ensemble, colour_bp_rp),
     )

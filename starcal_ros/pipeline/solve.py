@@ -7,7 +7,7 @@ A calibration has its provenance: software, options, catalog, prior and observat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 import dataclasses
 import hashlib
 import json
@@ -121,34 +121,15 @@ def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
 
 
 @one_blas_thread()
-def solve(
-    ensemble: Ensemble,
-    setup: Setup,
-    inputs: Mapping[str, str] | None = None,
-    active: Calibration | None = None,
-) -> Calibration:
+def solve(ensemble: Ensemble, setup: Setup, active: Calibration | None = None) -> Calibration:
     """
     A calibration of the ensemble, judged by the gate.
 
-    ``inputs`` names the sources of the observations, for the provenance; the gate limits the
-    change from ``active``, the calibration that this one would replace. Raises TooFewObservations
-    when the ensemble is too small; the text names the shortage.
+    The gate limits the change from ``active``, the calibration that this one would replace. Raises
+    TooFewObservations when the ensemble is too small; the text names the shortage.
     """
     setup = aligned_by(ensemble, setup)
-    return calibration_of(estimated(ensemble, setup), ensemble, setup, inputs, active)
-
-
-def calibration_of(
-    result: Estimate,
-    ensemble: Ensemble,
-    setup: Setup,
-    inputs: Mapping[str, str] | None = None,
-    active: Calibration | None = None,
-) -> Calibration:
-    """The calibration of an estimate of an ensemble, as of `solve`."""
-    provenance = provenance_of(setup, ensemble, inputs or {})
-    calibration = _not_judged(result, ensemble, setup, provenance)
-    return judged(calibration, ensemble, setup, active)
+    return calibration_of(estimated(ensemble, setup), ensemble, setup, active)
 
 
 @one_blas_thread()
@@ -173,10 +154,10 @@ def estimated(ensemble: Ensemble, setup: Setup) -> Estimate:
     return estimate_calibration(*given)
 
 
-def _not_judged(
-    result: Estimate, ensemble: Ensemble, setup: Setup, provenance: Mapping[str, str]
+def calibration_of(
+    result: Estimate, ensemble: Ensemble, setup: Setup, active: Calibration | None = None
 ) -> Calibration:
-    """An estimate with its statistics, before the gate."""
+    """The estimate of an ensemble with its statistics and provenance, judged as by `judged`."""
     kept, camera = result.kept, result.geometry.camera
     field = camera.field
     singular_values, weakest = observability.weakest_direction(
@@ -185,7 +166,7 @@ def _not_judged(
     stamps_ns = [image.time_ns for image in ensemble.images]
     budget = sigma_budget(result, setup.calibration, has_alignment=setup.has_tracker)
     has_dates = TIMES not in setup.origin
-    return Calibration(
+    calibration = Calibration(
         time_ns=max(stamps_ns),
         first_image_ns=min(stamps_ns),
         geometry=result.geometry,
@@ -215,7 +196,7 @@ def _not_judged(
         reasons=(),
         parent_frame=setup.frames.star_tracker_frame,
         child_frame=setup.frames.camera_frame,
-        provenance=provenance,
+        provenance=provenance_of(setup, ensemble),
         temperature=result.thermal,
         maps=observability.detector_maps(
             camera, result.map_covariance, result.table.measured_px[kept]
@@ -232,6 +213,7 @@ def _not_judged(
         sigma_budget=budget,
         statements=statements(budget, result, setup.calibration, has_dates=has_dates),
     )
+    return judged(calibration, ensemble, setup, active)
 
 
 # Twice the log likelihood of a field that is not there: the 1 % level of three amplitudes.
@@ -308,12 +290,8 @@ def _is_shown_by_stars(estimate: Estimate) -> bool:
     return not (problem.is_weak & (variance > 0.5 * problem.prior_sigma**2)).any()
 
 
-def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -> dict[str, str]:
-    """
-    Provenance of a calibration, sufficient to repeat it.
-
-    ``inputs`` maps the name of each input file to its digest.
-    """
+def provenance_of(setup: Setup, ensemble: Ensemble) -> dict[str, str]:
+    """Provenance of a calibration, sufficient to repeat it."""
     prior = np.r_[setup.prior.camera.parameters, setup.prior.star_tracker_from_camera_xyzw]
     return {
         'software': f'starcal {software_version()}',
@@ -323,7 +301,6 @@ def provenance_of(setup: Setup, ensemble: Ensemble, inputs: Mapping[str, str]) -
         'prior': json.dumps(prior.tolist()),
         'observations_sha256': _digest(ensemble),
         **setup.origin,
-        **{f'input {name}': value for name, value in inputs.items()},
     }
 
 
