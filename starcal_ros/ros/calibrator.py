@@ -347,21 +347,21 @@ class Calibrator(node.StarcalNode):
             calibration = self._state.active_on_disk
             if calibration is None:
                 frames = self._setup.frames
-                none, camera_info, alignment = none_active_to_messages(
+                message, camera_info, alignment = none_active_to_messages(
                     self._setup.prior.camera,
                     (frames.star_tracker_frame, frames.camera_frame),
                     tuple(self._state.withheld.values()),
                     node.make_message,
                 )
-                self._camera_info.publish(camera_info)
-                self._alignment.publish(alignment)
-                self._calibration.publish(none)
-                return
-            camera_info = camera_info_to_message(calibration, node.make_message)
-            alignment = alignment_to_message(calibration, node.make_message)
+            else:
+                message = calibration_to_message(calibration, node.make_message)
+                camera_info = camera_info_to_message(calibration, node.make_message)
+                alignment = alignment_to_message(calibration, node.make_message)
             self._camera_info.publish(camera_info)
             self._alignment.publish(alignment)
-            self._calibration.publish(calibration_to_message(calibration, node.make_message))
+            self._calibration.publish(message)
+            if calibration is None:
+                return
             if self._tf_static is not None:
                 transforms = [alignment, *mountings_to_messages(calibration, node.make_message)]
                 self._own_transforms += transforms
