@@ -173,7 +173,7 @@ class _ActivationKeys:
     schema: int
     event: Count
     before: Count
-    origin: str = ''
+    origin: str
 
 
 @dataclass(frozen=True)
@@ -571,9 +571,7 @@ def _activation(content: Mapping[str, Any], event: int, number: int) -> Activati
         raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
     if keys.before >= event:
         raise ValueError(f'archive.before: {keys.before} is not before {event}')
-    # A file of a version without origins: two events have a time in common only by chance.
-    origin = keys.origin or f'{event} at {calibration.active_since_ns}'
-    return Activation(event, keys.before, calibration, origin)
+    return Activation(event, keys.before, calibration, keys.origin)
 
 
 def _counts(content: Mapping[str, Any]) -> _RefusedFile:
