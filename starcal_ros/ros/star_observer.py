@@ -22,19 +22,12 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec, record_messages, sensor_messages
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import annotation, observe, setup
-from starcal_ros.records import (
-    CameraGeometry,
-    Image,
-    IMAGE_REFUSALS,
-    refused_image,
-    StarObservations,
-)
+from starcal_ros.records import CameraGeometry, Image, IMAGE_REFUSALS, StarObservations
 from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
@@ -322,7 +315,7 @@ class StarObserver(StarcalNode):
                 if not self.context.ok():
                     return  # shutdown: no refusal can be published
                 detail = f'{type(error).__name__}: {error}'
-                self._publish(self._refused(waiting, 'internal_error', detail))
+                self._publish(waiting.refused('internal_error', detail))
             self._latency_s.add(time.monotonic() - waiting.arrived_s)
             self.guarded(self.publish_health_change)()
 
@@ -346,7 +339,7 @@ class StarObserver(StarcalNode):
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:
             detail = f'{_IMAGES} images were in the queue'
-            self._publish(self._refused(waiting, 'overrun', detail))
+            self._publish(waiting.refused('overrun', detail))
             return
         offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
         size, channel = (camera.width, camera.height), self._setup.frames.image_channel
@@ -422,12 +415,6 @@ class StarObserver(StarcalNode):
                 f'{counted(len(images), "image")} without a match measured again: {len(used)} used'
             )
         return used
-
-    def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
-        width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))
-        return refused_image(
-            message_codec.nearest_stamp_ns(waiting.time_ns), width, height, reason, detail
-        )
 
     def _publish(self, observations: StarObservations) -> None:
         frame_id = self._setup.frames.camera_frame
