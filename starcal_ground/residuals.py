@@ -4,17 +4,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from starcal_ground.alignment import aligned_by
+from starcal_ground.smallest_lens import estimated
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.pipeline.solve import aligned_by, calibration_of, estimated
+from starcal_ros.pipeline.solve import calibration_of
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Calibration, Ensemble
@@ -109,11 +111,18 @@ def residuals_of(estimate: Estimate, ensemble: Ensemble, colour_bp_rp: Floats) -
 def solve_with_residuals(
     ensemble: Ensemble, setup: Setup, inputs: Mapping[str, str] | None = None
 ) -> tuple[Calibration, Residuals]:
-    """The calibration of `solve.solve`, and its residuals by star and image."""
+    """
+    The calibration of `solve.solve`, and its residuals by star and image.
+
+    ``inputs`` maps the names of the sources of the observations to their digests, for the
+    provenance.
+    """
     setup = aligned_by(ensemble, setup)
     found = estimated(ensemble, setup)
+    calibration = calibration_of(found, ensemble, setup)
+    sources = {f'input {name}': digest for name, digest in (inputs or {}).items()}
     colour_bp_rp = setup.catalog.colours_bp_rp(found.table.catalog_id)
     return (
-        calibration_of(found, ensemble, setup, inputs),
+        replace(calibration, provenance={**calibration.provenance, **sources}),
         residuals_of(found, ensemble, colour_bp_rp),
     )

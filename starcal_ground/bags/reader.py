@@ -41,6 +41,7 @@ import numpy as np
 from starcal_ground.bag_writer import ORIGIN
 from starcal_ground.bags import rosbag2
 from starcal_ground.file_kinds import NotABag
+from starcal_ros.constants import MAX_STAMP_NS
 from starcal_ros.errors import BagError, errors_as, ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.formats.messages.message_codec import Message, RawMessage
@@ -666,7 +667,7 @@ def image_stamp_ns(raw: RawMessage) -> int:
     try:
         return codec.stamp_ns(view_image(raw).header.stamp)
     except ImageRefused:
-        return codec.nearest_stamp_ns(raw.log_time_ns)
+        return min(max(raw.log_time_ns, 0), MAX_STAMP_NS)
 
 
 def _records_at(file: Path, offset: int) -> list[McapRecord]:
@@ -713,8 +714,7 @@ def read_observations(
         try:
             yield checked_observations(decode(raw))
         except BagError as error:
-            time_ns = codec.nearest_stamp_ns(raw.log_time_ns)
-            yield refused_image(time_ns, 0, 0, 'bad_observations', str(error))
+            yield refused_image(raw.log_time_ns, 0, 0, 'bad_observations', str(error))
 
 
 def decode(raw: RecordedMessage) -> Message:

@@ -44,7 +44,7 @@ class DetectorFrames:
 
         Raises ImageRefused ``bad_encoding`` if the dark frame has another type of pixels.
         """
-        return flattened(self._without_dark(image, options), self.flat, self.pedestal_dn)
+        return self._flattened(self._without_dark(image, options))
 
     def _without_dark(self, image: Image, options: CentroidOptions) -> Image:
         """Image minus dark frame, kept positive by adding the median of the dark frame."""
@@ -65,25 +65,20 @@ class DetectorFrames:
         level[(level > peak) | (pixels >= full_dn)] = peak
         return Image(image.time_ns, level)
 
+    def _flattened(self, image: Image) -> Image:
+        """Image divided by the flat field above the pedestal; of blind pixels as it is."""
+        pixels, flat = image.pixels, self.flat
+        if flat is None:
+            return image
+        peak = int(pixels.max())
+        signal = (pixels.astype(np.float32) - self.pedestal_dn) / np.nan_to_num(flat, nan=1.0)
+        level = np.clip(np.rint(signal + self.pedestal_dn), 0, peak)
+        level[pixels == peak] = peak  # so that saturated pixels are still found
+        cast = level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
+        return Image(image.time_ns, cast)
+
 
 NO_FRAMES = DetectorFrames()
-
-
-def flattened(image: Image, flat: Floats | None, pedestal_dn: int) -> Image:
-    """
-    Image divided by the flat field above a pedestal; of blind pixels as it is.
-
-    The brightest pixels stay at the peak of the image, so that saturated ones are still found.
-    """
-    if flat is None:
-        return image
-    pixels = image.pixels
-    peak = int(pixels.max())
-    signal = (pixels.astype(np.float32) - pedestal_dn) / np.nan_to_num(flat, nan=1.0)
-    level = np.clip(np.rint(signal + pedestal_dn), 0, peak)
-    level[pixels == peak] = peak
-    cast = level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
-    return Image(image.time_ns, cast)
 
 
 def read_detector_frames(

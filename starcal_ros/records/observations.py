@@ -14,7 +14,7 @@ import numpy as np
 from starcal_ros import record_fields as fields
 from starcal_ros.arrays import Codes, Floats, Integers, Mask, Pixels, Singles
 from starcal_ros.camera import MAX_SIDE_PX
-from starcal_ros.constants import NANOSECONDS_PER_SECOND
+from starcal_ros.constants import MAX_STAMP_NS, NANOSECONDS_PER_SECOND
 
 IMAGE_REFUSALS: Mapping[str, str] = {
     'bad_encoding': 'the pixel encoding is not one of mono8, mono16, 8UC1, 16UC1',
@@ -312,10 +312,14 @@ STAR_COLUMNS = (
 def refused_image(
     time_ns: int, width: int, height: int, refusal: str, detail: str, **known: object
 ) -> StarObservations:
-    """Observations without stars: the record of an image that cannot be used, and why."""
-    return StarObservations.of_image(
-        time_ns, (width, height), refusal=refusal, detail=detail, **known
-    )
+    """
+    Observations without stars: the record of an image that cannot be used, and why.
+
+    The nearest that a message can hold replaces a stamp or side that none can hold.
+    """
+    time_ns = min(max(time_ns, 0), MAX_STAMP_NS)
+    size = min(width, MAX_SIDE_PX), min(height, MAX_SIDE_PX)
+    return StarObservations.of_image(time_ns, size, refusal=refusal, detail=detail, **known)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)

@@ -11,8 +11,6 @@ them is active and which were withdrawn, for readers: a calibrator judges them a
 A file is written beside its place, synced, renamed, and the folder synced; it is never changed
 afterwards.  So at any instant each file is complete or absent.
 
-A writer passes its content through the reader, which so accepts each file of this module.
-
 The folder is untrusted input.  Only regular files of limited size are opened.  A file with a wrong
 seal (`Seal`), or with content that is no image or no calibration, is renamed to ``….damaged``
 and skipped.  A file that cannot be read is an error, since it may be sound.  With a key, the name
@@ -175,7 +173,7 @@ class _ActivationKeys:
     schema: int
     event: Count
     before: Count
-    origin: str = ''
+    origin: str
 
 
 @dataclass(frozen=True)
@@ -219,10 +217,6 @@ class Archive:
         A sentence for each file that was set aside or skipped.
     last_event : int
         The highest number given to any file.
-    collections : Collections
-        Those of the images on disk.
-    camera_frame : str
-        The camera that the images on disk are of; empty if not recorded.
     """
 
     def __init__(self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS) -> None:
@@ -416,9 +410,7 @@ class Archive:
         }
         number = record.calibration.number
         name = f'{record.event:08d}_calibration_{number:08d}.json'
-        path = self._write(
-            _CALIBRATIONS, name, content, lambda read: _activation(read, record.event, number)
-        )
+        path = self._write(_CALIBRATIONS, name, self._seal.sealed(content).encode())
         self._events[record.event] = _KeptEvent(record.origin, path)
         self.last_event = max(self.last_event, record.event)
 
@@ -433,7 +425,7 @@ class Archive:
         is_needed = ensemble.images or ensemble.refused or collections.ended
         if counts == self._counts or not is_needed:
             return
-        self._write(_ENSEMBLE, _REFUSED, json_object(counts), _counts)
+        self._write(_ENSEMBLE, _REFUSED, self._seal.sealed(json_object(counts)).encode())
         self._counts = counts
 
     def _keep_image(self, image: StarObservations) -> None:
@@ -450,29 +442,13 @@ class Archive:
             return
         mark = self._seal.mark(number, data)
         name = f'{number:08d}_{mark}.mcap' if mark else f'{number:08d}.mcap'
-        path = self._write_file(_ENSEMBLE, name, data)
+        path = self._write(_ENSEMBLE, name, data)
         self._images[image.time_ns] = _KeptImage(image, path)
         self._next_image += 1
         if stale is not None:
             stale.path.unlink(missing_ok=True)
 
-    def _write(
-        self,
-        folder: str,
-        name: str,
-        content: Mapping[str, object],
-        read: Callable[[Mapping[str, Any]], object],
-    ) -> Path:
-        """Write a sealed object that its reader takes; raises ArchiveError if it would not."""
-        text = self._seal.sealed(content)
-        try:
-            read(self._seal.opened(text.encode()))
-        except (ProductError, ValueError) as error:
-            words = f'state_dir: {name} not written, no start would read it: {error}'
-            raise ArchiveError(words) from error
-        return self._write_file(folder, name, text.encode())
-
-    def _write_file(self, folder: str, name: str, data: bytes) -> Path:
+    def _write(self, folder: str, name: str, data: bytes) -> Path:
         if len(data) > _MOST_BYTES:
             raise ArchiveError(
                 f'state_dir: {name} not written, its {len(data)} bytes are more than a start '
@@ -595,9 +571,7 @@ def _activation(content: Mapping[str, Any], event: int, number: int) -> Activati
         raise ValueError(f'is event {keys.event} of calibration {calibration.number}')
     if keys.before >= event:
         raise ValueError(f'archive.before: {keys.before} is not before {event}')
-    # A file of a version without origins: two events have a time in common only by chance.
-    origin = keys.origin or f'{event} at {calibration.active_since_ns}'
-    return Activation(event, keys.before, calibration, origin)
+    return Activation(event, keys.before, calibration, keys.origin)
 
 
 def _counts(content: Mapping[str, Any]) -> _RefusedFile:

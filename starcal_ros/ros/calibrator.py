@@ -38,7 +38,7 @@ from starcal_ros.formats.messages.record_messages import (
     status_to_message,
 )
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.setup import CalibratorOptions, check_site, load_setup
+from starcal_ros.pipeline.setup import CalibratorOptions, load_stated_setup
 from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros import node
 from starcal_ros.ros.inputs import LATCHED
@@ -93,8 +93,7 @@ class Calibrator(node.StarcalNode):
         """Load the prior camera, options and state folder, create the latched publishers."""
         values = self.options.values()
         self._own = from_mapping(CalibratorOptions, values)
-        self._setup = load_setup(values)
-        check_site(self._setup.site)
+        self._setup = load_stated_setup(values)
         self._state.open(self._setup, self._own)
         self.get_logger().info(str(self._state))
         for text in (*self._state.damage, *self._state.withheld.values()):
@@ -347,21 +346,21 @@ class Calibrator(node.StarcalNode):
             calibration = self._state.active_on_disk
             if calibration is None:
                 frames = self._setup.frames
-                none, camera_info, alignment = none_active_to_messages(
+                message, camera_info, alignment = none_active_to_messages(
                     self._setup.prior.camera,
                     (frames.star_tracker_frame, frames.camera_frame),
                     tuple(self._state.withheld.values()),
                     node.make_message,
                 )
-                self._camera_info.publish(camera_info)
-                self._alignment.publish(alignment)
-                self._calibration.publish(none)
-                return
-            camera_info = camera_info_to_message(calibration, node.make_message)
-            alignment = alignment_to_message(calibration, node.make_message)
+            else:
+                message = calibration_to_message(calibration, node.make_message)
+                camera_info = camera_info_to_message(calibration, node.make_message)
+                alignment = alignment_to_message(calibration, node.make_message)
             self._camera_info.publish(camera_info)
             self._alignment.publish(alignment)
-            self._calibration.publish(calibration_to_message(calibration, node.make_message))
+            self._calibration.publish(message)
+            if calibration is None:
+                return
             if self._tf_static is not None:
                 transforms = [alignment, *mountings_to_messages(calibration, node.make_message)]
                 self._own_transforms += transforms

@@ -19,7 +19,7 @@ import numpy as np
 
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import ImageRefused
-from starcal_ros.records import AttitudeSample
+from starcal_ros.records import AttitudeSample, refused_image, StarObservations
 from starcal_ros.sky.attitude import AttitudeHistory
 from starcal_ros.text import significant
 
@@ -45,6 +45,10 @@ class Waiting:
     height: int
     message: Any
     arrived_s: float
+
+    def refused(self, reason: str, detail: str) -> StarObservations:
+        """Observations without stars, as the image cannot be measured."""
+        return refused_image(self.time_ns, self.width, self.height, reason, detail)
 
 
 class ImageQueue:

@@ -22,19 +22,12 @@ from sensor_msgs.msg import Image as ImageMessage
 
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
-from starcal_ros.camera import MAX_SIDE_PX
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import ImageRefused, OptionError
+from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec, record_messages, sensor_messages
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import annotation, observe, setup
-from starcal_ros.records import (
-    CameraGeometry,
-    Image,
-    IMAGE_REFUSALS,
-    refused_image,
-    StarObservations,
-)
+from starcal_ros.records import CameraGeometry, Image, IMAGE_REFUSALS, StarObservations
 from starcal_ros.ros.image_queue import ImageQueue, Recent, StarTrackers, Waiting
 from starcal_ros.ros.inputs import LATCHED
 from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WARN
@@ -74,13 +67,7 @@ class StarObserver(StarcalNode):
         """Load the prior camera and the catalog, create the publishers."""
         values = self.options.values()
         self._own = from_mapping(setup.ObserverOptions, values)
-        self._setup = setup.load_setup(values)
-        setup.check_site(self._setup.site)
-        if not self._setup.is_aligned:
-            raise OptionError(
-                'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'
-                ' setup_finder beside the camera'
-            )
+        self._setup = setup.load_stated_setup(values)
         self._geometry = self._setup.prior
         self._calibration_number = 0  # the calibration that predicts the stars; 0: the prior
         self._withdrawn = ''  # why the prior predicts the stars where a calibration did
@@ -103,10 +90,9 @@ class StarObserver(StarcalNode):
             self._setup.attitude.max_attitude_gap_s,
             self._own.attitude_timeout_s,
         )
-        # The last images that matched nothing, which a calibration or an attitude may mend.
-        self._unmatched: deque[Image] = deque(maxlen=_KEPT)
-        # By the stamps of these: the star trackers awaited then.
-        self._awaiting: dict[int, frozenset[int]] = {}
+        # The last images that matched nothing, which a calibration may mend, or an attitude of the
+        # star trackers that each still awaits.
+        self._unmatched: tuple[tuple[Image, frozenset[int]], ...] = ()
         self._track = observe.Track(self._geometry)
         self._predicted_from = self._geometry
         self._velocities: deque[tuple[int, Any]] = deque(maxlen=_SAMPLES.depth)
@@ -236,7 +222,7 @@ class StarObserver(StarcalNode):
         time_ns, quaternion = sensor_messages.attitude_from_message(message)
         direction = self._setup.attitude.attitude_direction
         self._star_trackers.add(which, time_ns, attitude_sample(time_ns, quaternion, direction))
-        if self._awaiting:
+        if any(awaited for _, awaited in self._unmatched):
             self._in_worker(self._measure_awaiting)
         self._queue.wake()
 
@@ -329,7 +315,7 @@ class StarObserver(StarcalNode):
                 if not self.context.ok():
                     return  # shutdown: no refusal can be published
                 detail = f'{type(error).__name__}: {error}'
-                self._publish(self._refused(waiting, 'internal_error', detail))
+                self._publish(waiting.refused('internal_error', detail))
             self._latency_s.add(time.monotonic() - waiting.arrived_s)
             self.guarded(self.publish_health_change)()
 
@@ -353,7 +339,7 @@ class StarObserver(StarcalNode):
     def _measure(self, waiting: Waiting) -> None:
         if waiting.message is None:
             detail = f'{_IMAGES} images were in the queue'
-            self._publish(self._refused(waiting, 'overrun', detail))
+            self._publish(waiting.refused('overrun', detail))
             return
         offset_s, camera = self._setup.attitude.stamp_offset_s, self._setup.prior.camera
         size, channel = (camera.width, camera.height), self._setup.frames.image_channel
@@ -373,10 +359,8 @@ class StarObserver(StarcalNode):
             self.get_logger().warning('image stamps went back: restarted the sequence')
         self._publish(observations)
         if observations.refusal == 'no_match':
-            self._unmatched.append(image)
-            if awaited:
-                self._awaiting[image.time_ns] = awaited
-                self._measure_awaiting()
+            self._unmatched = (*self._unmatched, (image, awaited))[-_KEPT:]
+            self._measure_awaiting()
         if self._annotated.get_subscription_count():
             self._publish_annotated(image, observations, before.geometry)
 
@@ -400,38 +384,29 @@ class StarObserver(StarcalNode):
 
     def _measure_again(self) -> None:
         """Measure the images that matched nothing with the calibration that became active."""
-        self._retry(list(self._unmatched))
-        self._unmatched.clear()
+        self._retry([image for image, _ in self._unmatched])
+        self._unmatched = ()
 
     def _measure_awaiting(self) -> None:
         """Measure the images that matched nothing and whose awaited attitude has come."""
-        before = {
-            image.time_ns: self._awaiting[image.time_ns]
-            for image in self._unmatched
-            if image.time_ns in self._awaiting
-        }
-        now = {stamp: self._star_trackers.awaited(stamp) for stamp in before}
-        self._awaiting = {stamp: which for stamp, which in now.items() if which}
+        still = [
+            (image, awaited & self._star_trackers.awaited(image.time_ns), awaited)
+            for image, awaited in self._unmatched
+        ]
+        used_ns = self._retry([image for image, now, before in still if now != before])
         # The others are kept for a calibration.
-        used = self._retry(
-            [
-                image
-                for image in self._unmatched
-                if now.get(image.time_ns) != before.get(image.time_ns)
-            ]
+        self._unmatched = tuple(
+            (image, now) for image, now, _ in still if image.time_ns not in used_ns
         )
-        stamps_ns = {image.time_ns for image in used}
-        kept = [image for image in self._unmatched if image.time_ns not in stamps_ns]
-        self._unmatched = deque(kept, _KEPT)
 
-    def _retry(self, images: Sequence[Image]) -> list[Image]:
-        """Measure images again that matched nothing; return those that are used."""
-        used = []
+    def _retry(self, images: Sequence[Image]) -> set[int]:
+        """Measure images again that matched nothing; return the stamps of those that are used."""
+        used = set()
         for image in images:
             observations, _ = self._observe_next(image, observe.Track(self._geometry))
             self._retried += 1
             if not observations.refusal:
-                used.append(image)
+                used.add(image.time_ns)
                 self._retried_used += 1
                 self._counts['no_match'] -= 1
                 self._publish(observations)
@@ -440,12 +415,6 @@ class StarObserver(StarcalNode):
                 f'{counted(len(images), "image")} without a match measured again: {len(used)} used'
             )
         return used
-
-    def _refused(self, waiting: Waiting, reason: str, detail: str) -> StarObservations:
-        width, height = (min(side, MAX_SIDE_PX) for side in (waiting.width, waiting.height))
-        return refused_image(
-            message_codec.nearest_stamp_ns(waiting.time_ns), width, height, reason, detail
-        )
 
     def _publish(self, observations: StarObservations) -> None:
         frame_id = self._setup.frames.camera_frame

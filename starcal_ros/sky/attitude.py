@@ -102,7 +102,8 @@ class AttitudeHistory:
     Parameters
     ----------
     keep_s : float
-        Age relative to the newest sample of the run, beyond which samples are dropped.
+        Age relative to the newest sample of the run, beyond which samples are dropped once they
+        are half of all.
     jump_s : float
         Difference of stamps that counts as a jump; at least the longest gap to interpolate over.
     """
@@ -226,20 +227,18 @@ class _Run:
     def __init__(self) -> None:
         self._times_ns = array('q')
         self._xyzw = array('d')  # four per sample; NaN for an invalid one
-        self._start = 0  # samples before this index are dropped
 
     def __len__(self) -> int:
-        return len(self._times_ns) - self._start
+        return len(self._times_ns)
 
     def columns(self) -> tuple[Indices, Floats]:
         """Stamps (n,) and attitudes (n, 4); NaN for an invalid one."""
-        xyzw = np.array(self._xyzw[4 * self._start :]).reshape(-1, 4)
-        return np.array(self._times_ns[self._start :], np.int64), xyzw
+        return np.array(self._times_ns, np.int64), np.array(self._xyzw).reshape(-1, 4)
 
     @property
     def first_ns(self) -> int:
         """Stamp of the oldest sample."""
-        return self._times_ns[self._start]
+        return self._times_ns[0]
 
     @property
     def last_ns(self) -> int:
@@ -250,7 +249,7 @@ class _Run:
         """Insert a sample in its place."""
         xyzw = array('d', _INVALID if sample is None else sample.icrf_from_star_tracker_xyzw)
         k = self._index(time_ns)
-        if k < len(self._times_ns) and self._times_ns[k] == time_ns:
+        if k < len(self) and self._times_ns[k] == time_ns:
             if math.isnan(self._xyzw[4 * k]):
                 self._xyzw[4 * k : 4 * k + 4] = xyzw
             return
@@ -259,20 +258,17 @@ class _Run:
 
     def put_before(self, earlier: _Run) -> None:
         """Prepend the samples of a run that ends before this one starts."""
-        self._times_ns = earlier._times_ns[earlier._start :] + self._times_ns[self._start :]
-        self._xyzw = earlier._xyzw[4 * earlier._start :] + self._xyzw[4 * self._start :]
-        self._start = 0
+        self._times_ns = earlier._times_ns + self._times_ns
+        self._xyzw = earlier._xyzw + self._xyzw
 
     def forget_before(self, horizon_ns: int) -> None:
-        """Drop samples before a time."""
-        while len(self) > 1 and self.first_ns < horizon_ns:
-            self._start += 1
-        if self._start > len(self._times_ns) // 2:  # rarely: the deletion moves all the rest
-            del self._times_ns[: self._start], self._xyzw[: 4 * self._start]
-            self._start = 0
+        """Drop the samples before a time once they are half of all: that moves all the rest."""
+        old = self._index(horizon_ns)
+        if 2 * old > len(self):
+            del self._times_ns[:old], self._xyzw[: 4 * old]
 
     def _index(self, time_ns: int) -> int:
-        return bisect.bisect_left(self._times_ns, time_ns, lo=self._start)
+        return bisect.bisect_left(self._times_ns, time_ns)
 
     def _valid(self, low: int, high: int) -> Mask:
         """Mask of the valid samples in a range of indices."""
@@ -280,7 +276,7 @@ class _Run:
 
     def around(self, time_ns: int, max_gap_s: float) -> tuple[AttitudeSample, AttitudeSample]:
         """See `AttitudeHistory.around`."""
-        k, end = self._index(time_ns), len(self._times_ns)
+        k, end = self._index(time_ns), len(self)
         if k < end and self._times_ns[k] == time_ns:
             if self._valid(k, k + 1).all():
                 sample = self._sample(k)
@@ -294,11 +290,11 @@ class _Run:
             gap_s = (self._times_ns[j] - self._times_ns[i]) / NANOSECONDS_PER_SECOND
             if gap_s <= max_gap_s:
                 return self._sample(i), self._sample(j)
-        about = self._valid(max(k - 1, self._start), min(k + 1, end))
+        about = self._valid(max(k - 1, 0), min(k + 1, end))
         if len(about) and not about.all():
             raise ImageRefused('bad_attitude', 'the samples next to the image are invalid')
-        if k in (self._start, end):
-            side = 'before' if k == self._start else 'after'
+        if k in (0, end):
+            side = 'before' if k == 0 else 'after'
             raise ImageRefused('no_attitude', f'no attitude sample {side} the image')
         gap_s = (self._times_ns[k] - self._times_ns[k - 1]) / NANOSECONDS_PER_SECOND
         raise ImageRefused('attitude_gap', f'{gap_s:.3f} s between samples, over {max_gap_s:g} s')
@@ -426,20 +422,19 @@ def attitudes_at(
     from scipy.spatial.transform import Rotation  # half of the start of a short command
 
     usable: list[Attitude] = []
-    refusal: ImageRefused | None = None
-    try:
-        rate = first.rate_at(time_ns, max_gap_s, sample_sigma_rad)
-        usable.append(Attitude(*first.at(time_ns, max_gap_s), *rate))
-    except ImageRefused as refused:
-        refusal = refused
-    for history, mounting in zip(others, mountings, strict=True):
+    refusals: list[ImageRefused] = []
+    for history, mounting in zip((first, *others), (None, *mountings), strict=True):
         try:
             quaternion, gap_s = history.at(time_ns, max_gap_s)
-        except ImageRefused:
+        except ImageRefused as refused:
+            refusals.append(refused)
+            continue
+        rate_rad_s, sigma_rad_s = history.rate_at(time_ns, max_gap_s, sample_sigma_rad)
+        if mounting is None:
+            usable.append(Attitude(quaternion, gap_s, rate_rad_s, sigma_rad_s))
             continue
         mounted = Rotation.from_quat(mounting.first_from_star_tracker_xyzw)
         first_xyzw = (Rotation.from_quat(quaternion) * mounted.inv()).as_quat()
-        rate_rad_s, sigma_rad_s = history.rate_at(time_ns, max_gap_s, sample_sigma_rad)
         # The axes of a star tracker lie across those of the first one: each takes its part.
         sigma_rad_s = np.sqrt(mounted.as_matrix() ** 2 @ sigma_rad_s**2)
         usable.append(
@@ -452,6 +447,6 @@ def attitudes_at(
                 mounting.first_from_star_tracker_xyzw,
             )
         )
-    if refusal is not None and not usable:
-        raise refusal
+    if not usable:
+        raise refusals[0]
     return sorted(usable, key=lambda attitude: taken.get(attitude.star_tracker, 0))

@@ -20,7 +20,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import AnyArray, Codes, Floats, Indices, Mask, Rows, rows_of, Singles
+from starcal_ros.arrays import AnyArray, Codes, Floats, Indices, Mask, Rows, rows_of
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import CatalogError, errors_as
 from starcal_ros.untrusted import read_archive
@@ -58,7 +58,6 @@ DEEPER_MAG = 2.0
 # Margin of a cone: 35 years of motion of the fastest star (8.7 arcsec a year) and 20 arcsec of
 # aberration.
 CONE_MARGIN_RAD = 330 * ARCSECOND_RAD
-_STEP_RAD = 0.05  # grid of directions with cached surroundings: every axis is within 0.87 steps
 
 
 # 1-sigma of the proper motion of a star of V = 9 per axis, and its factor for each magnitude
@@ -156,19 +155,13 @@ class StarCatalog:
         )
 
     @cached_property
-    def directions_single(self) -> Singles:
-        """The same in single precision, (3, n)."""
-        return np.ascontiguousarray(self.direction_icrs.T, np.float32)
-
-    @cached_property
     def tree(self) -> cKDTree:
         """Search tree of the directions."""
         return direction_tree(self.direction_icrs)
 
     def near(self, direction_icrs: Floats, radius_rad: float) -> Rows:
         """Rows (m,), ascending, of the stars near any of some directions (n, 3), as `cone`."""
-        chord = 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
-        rows = self.tree.query_ball_point(direction_icrs, chord)
+        rows = self.tree.query_ball_point(direction_icrs, _chord_with_margin(radius_rad))
         return np.unique(np.fromiter(itertools.chain.from_iterable(rows), np.intp))
 
     def select(self, rows: Mask | Indices | Rows | slice) -> StarCatalog:
@@ -325,31 +318,15 @@ def cone(
     magnitude_limit : float, optional
         Omit stars fainter than this V.
     """
-    axis = np.asarray(direction_icrs / np.linalg.norm(direction_icrs))
-    reach_rad = radius_rad + CONE_MARGIN_RAD
-    middle = np.round(axis / _STEP_RAD).astype(int)
-    about, direction_icrs = _surroundings(catalog, tuple(middle.tolist()), reach_rad + _STEP_RAD)
-    # A cosine does not resolve angles below 1e-8 rad; the margin is 1.6e-3.
-    rows: Rows = about[np.asarray(direction_icrs @ axis >= math.cos(min(reach_rad, math.pi)))]
+    axis, chord = direction_icrs / np.linalg.norm(direction_icrs), _chord_with_margin(radius_rad)
+    rows = np.sort(np.array(catalog.tree.query_ball_point(axis, chord), np.intp))
     if magnitude_limit is not None:
         rows = rows[catalog.magnitude[rows] <= magnitude_limit]
     return rows
 
 
-@lru_cache(maxsize=4)
-def _surroundings(
-    catalog: StarCatalog, middle: tuple[int, ...], radius_rad: float
-) -> tuple[Rows, Floats]:
-    """
-    Rows (m,) and directions (m, 3) of the stars about a direction (3,), in steps.
-
-    Kept for the next images: few cameras turn far from one to the next.
-    """
-    axis = np.array(middle) / np.linalg.norm(middle)
-    # In single precision, good to 3e-7: less is read of the whole catalog.
-    least = math.cos(min(radius_rad, math.pi)) - 1e-6
-    rows = np.flatnonzero(axis.astype(np.float32) @ catalog.directions_single >= least)
-    return rows, catalog.direction_icrs.take(rows, axis=0)
+def _chord_with_margin(radius_rad: float) -> float:
+    return 2.0 * math.sin(0.5 * min(radius_rad + CONE_MARGIN_RAD, math.pi))
 
 
 def sky_circle(direction_icrs: Floats, radius_rad: float) -> str:

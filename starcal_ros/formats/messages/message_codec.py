@@ -37,7 +37,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from starcal_ros.arrays import AnyArray, Floats
-from starcal_ros.constants import MAX_STAMP_NS, NANOSECONDS_PER_SECOND
+from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.record_fields import fields_of, FieldType, plain_record, read_record
 
 IMAGE_TYPE = 'sensor_msgs/msg/Image'
@@ -84,11 +84,6 @@ class Make(Protocol):
 def stamp_ns(stamp: Message) -> int:
     """Nanoseconds of a builtin_interfaces/Time, exactly."""
     return int(stamp.sec) * NANOSECONDS_PER_SECOND + int(stamp.nanosec)
-
-
-def nearest_stamp_ns(time_ns: int) -> int:
-    """The nearest time that a ROS message can hold."""
-    return min(max(time_ns, 0), MAX_STAMP_NS)
 
 
 def offset_ns(seconds: float) -> int:

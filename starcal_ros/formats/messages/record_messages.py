@@ -194,20 +194,11 @@ def none_active_to_messages(
     The first has ``reasons`` and no camera, the second K of zeros, ROS's word for a camera that is
     not calibrated, the third a rotation of zeros. ``frames`` are star tracker and camera.
     """
-    parent_frame, child_frame = frames
-    header = codec.make_header(0, child_frame, make)
+    header = codec.make_header(0, frames[1], make)
     return (
         make(codec.CALIBRATION_TYPE, header=header, reasons=list(reasons)),
         make(codec.CAMERA_INFO_TYPE, header=header, height=prior.height, width=prior.width),
-        make(
-            codec.ALIGNMENT_TYPE,
-            header=codec.make_header(0, parent_frame, make),
-            child_frame_id=child_frame,
-            transform=make(
-                'geometry_msgs/msg/Transform',
-                rotation=codec.quaternion_to_message(np.zeros(4), make),
-            ),
-        ),
+        _transform(0, frames, np.zeros(4), make),
     )
 
 
@@ -259,26 +250,28 @@ def camera_info_to_message(calibration: Calibration, make: codec.Make) -> codec.
 
 def mountings_to_messages(calibration: Calibration, make: codec.Make) -> list[codec.Message]:
     """geometry_msgs/TransformStamped of each further star tracker in the frame of the first."""
+    time_ns, parent_frame = calibration.time_ns, calibration.parent_frame
     return [
-        _in_star_tracker(calibration, tracker.frame, tracker.first_from_star_tracker_xyzw, make)
-        for tracker in calibration.star_trackers[1:]
+        _transform(time_ns, (parent_frame, one.frame), one.first_from_star_tracker_xyzw, make)
+        for one in calibration.star_trackers[1:]
     ]
 
 
 def alignment_to_message(calibration: Calibration, make: codec.Make) -> codec.Message:
     """Return a geometry_msgs/TransformStamped: the camera frame in the star tracker frame."""
+    frames = calibration.parent_frame, calibration.child_frame
     rotation_xyzw = calibration.geometry.star_tracker_from_camera_xyzw
-    return _in_star_tracker(calibration, calibration.child_frame, rotation_xyzw, make)
+    return _transform(calibration.time_ns, frames, rotation_xyzw, make)
 
 
-def _in_star_tracker(
-    calibration: Calibration, frame: str, rotation_xyzw: Floats, make: codec.Make
+def _transform(
+    time_ns: int, frames: tuple[str, str], rotation_xyzw: Floats, make: codec.Make
 ) -> codec.Message:
-    """A frame of that orientation in the frame of the (first) star tracker."""
+    """The orientation of the second of two frames in the first, which have one origin."""
     return make(
         codec.ALIGNMENT_TYPE,
-        header=codec.make_header(calibration.time_ns, calibration.parent_frame, make),
-        child_frame_id=frame,
+        header=codec.make_header(time_ns, frames[0], make),
+        child_frame_id=frames[1],
         transform=make(
             'geometry_msgs/msg/Transform',
             translation=codec.vector_to_message(np.zeros(3), make),

@@ -19,7 +19,7 @@ import numpy as np
 from starcal_ros import opencv as cv2
 from starcal_ros.arrays import AnyArray, Floats
 from starcal_ros.camera import MAX_SIDE_PX
-from starcal_ros.constants import FASTEST_M_S
+from starcal_ros.constants import FASTEST_M_S, MAX_STAMP_NS
 from starcal_ros.errors import ImageRefused
 from starcal_ros.formats.messages import message_codec as codec
 from starcal_ros.records import Image, LEAST_DEGC, MOST_DEGC, refused_image, StarObservations
@@ -245,7 +245,7 @@ def image_from_message(
     Raises ImageRefused ``bad_stamp``, ``bad_encoding``, ``bad_layout`` or ``wrong_size``.
     """
     time_ns = codec.stamp_ns(message.header.stamp) + codec.offset_ns(stamp_offset_s)
-    if time_ns != codec.nearest_stamp_ns(time_ns):
+    if not 0 <= time_ns <= MAX_STAMP_NS:
         raise ImageRefused('bad_stamp', f'{time_ns} ns is not within the range of ROS stamps')
     if not hasattr(message, 'encoding'):
         return decode_compressed(message.data, time_ns, size, channel)
@@ -311,8 +311,7 @@ def image_of(
     try:
         message = view_image(raw)
     except ImageRefused as refused:
-        time_ns = codec.nearest_stamp_ns(raw.log_time_ns)
-        return refused_image(time_ns, 0, 0, refused.reason, refused.detail)
+        return refused_image(raw.log_time_ns, 0, 0, refused.reason, refused.detail)
     try:
         return image_from_message(message, stamp_offset_s, size, channel)
     except ImageRefused as refused:
@@ -324,13 +323,9 @@ def refused_from_message(
 ) -> StarObservations:
     """Return the record of a message of an image, or of its stars, that cannot be used."""
     time_ns = codec.stamp_ns(message.header.stamp) + codec.offset_ns(stamp_offset_s)
-    return refused_image(
-        codec.nearest_stamp_ns(time_ns),
-        min(int(getattr(message, 'width', 0)), MAX_SIDE_PX),  # not in a compressed image
-        min(int(getattr(message, 'height', 0)), MAX_SIDE_PX),
-        refused.reason,
-        refused.detail,
-    )
+    # A compressed image has no size.
+    width, height = (int(getattr(message, side, 0)) for side in ('width', 'height'))
+    return refused_image(time_ns, width, height, refused.reason, refused.detail)
 
 
 def image_to_message(

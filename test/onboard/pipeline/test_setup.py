@@ -19,15 +19,42 @@ from starcal_ros.camera import CameraModel
 from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline import observe
-from starcal_ros.pipeline.detector_frames import flattened
-from starcal_ros.pipeline.setup import check_field_of_stars, load_setup, OPTION_CLASSES, Setup
+from starcal_ros.pipeline.detector_frames import DetectorFrames
+from starcal_ros.pipeline.setup import (
+    check_field_of_stars,
+    load_setup,
+    load_stated_setup,
+    OPTION_CLASSES,
+    Setup,
+)
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
+from starcal_ros.stars.image_model import CentroidOptions
 
 
 @pytest.fixture(scope='module')
 def setup(camera_yaml: Path) -> Setup:
     return load_setup(values(camera_yaml))
+
+
+@pytest.mark.parametrize(
+    ('left_out', 'words'),
+    [
+        (
+            {'prior_alignment': 4 * [0.0]},
+            'prior_alignment: not given: starcal calibrate BAG finds',
+        ),
+        ({'lens_model': 'auto'}, 'lens_model: auto: starcal calibrate finds the model; give its'),
+        ({'observer': 'ground'}, 'observer: ground needs the site: set latitude_deg'),
+    ],
+)
+def test_a_node_on_board_finds_no_part_of_its_setup(
+    camera_yaml: Path, left_out: dict[str, object], words: str
+) -> None:
+    given = values(camera_yaml, **left_out)
+    load_setup(given)  # on the ground
+    with pytest.raises(OptionError, match=words):
+        load_stated_setup(given)
 
 
 def test_a_deep_catalog_need_not_cover_the_sky() -> None:
@@ -267,7 +294,8 @@ def test_pixels_without_response_or_with_a_current_are_bad(
     path = write_png(tmp_path / 'frame.png', frame)
     setup = load_setup(values(camera_yaml, **{option: path}))
     assert setup.detector.hot.index.tolist() == [7 * WIDTH + 9]
-    assert (flattened(image(), setup.detector.flat, 0).pixels == image().pixels).all()
+    corrected = DetectorFrames(flat=setup.detector.flat).corrected(image(), setup.centroid)
+    assert (corrected.pixels == image().pixels).all()
 
 
 def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
@@ -288,8 +316,8 @@ def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
 def test_saturated_pixels_stay_at_the_peak() -> None:
     pixels = np.array([[4095, 2000], [1000, 4095]], np.uint16)
     flat = np.array([[1.5, 0.25], [0.5, 0.5]])
-    found = flattened(Image(1, pixels), flat, 0).pixels
-    assert found.tolist() == [[4095, 4095], [2000, 4095]]
+    found = DetectorFrames(flat=flat).corrected(Image(1, pixels), CentroidOptions())
+    assert found.pixels.tolist() == [[4095, 4095], [2000, 4095]]
 
 
 @pytest.mark.parametrize(
