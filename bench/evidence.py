@@ -36,7 +36,6 @@ from starcal_ground.cli.arguments import number
 from starcal_ground.images.first_setup import air_of
 from starcal_ground.parameter_files import read_values
 from starcal_ground.products import write_camera_info
-from starcal_ground.residuals import solve_with_residuals
 from starcal_ground.simulation.centroids import scenario_information
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import GRID, line_of_sight_table
@@ -51,6 +50,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import StarcalError
 from starcal_ros.formats.messages.message_codec import VELOCITY_TYPE
 from starcal_ros.pipeline.setup import load_setup, Setup
+from starcal_ros.pipeline.solve import solve
 from starcal_ros.records import Calibration
 from studies import missions, rendered_worlds, worlds
 from studies.trials import rms
@@ -224,9 +224,7 @@ def real_set(folder: Path) -> dict[str, object]:
     half, found, ratios = len(good) // 2, {'whole': whole.calibration}, {}
     splits = {'turns': (good[::2], good[1::2]), 'time': (good[:half], good[half:])}
     for split, parts in splits.items() if half > 1 else ():
-        two = [
-            solve_with_residuals(ensemble_of(part, whole.setup), whole.setup)[0] for part in parts
-        ]
+        two = [solve(ensemble_of(part, whole.setup), whole.setup) for part in parts]
         found |= {f'{split} {k}': one for k, one in enumerate(two)}
         (one, sigma), (other, other_sigma) = map(_inner, two)
         off_arcsec = rms(trials.shape_errors_arcsec(one, other))

@@ -155,9 +155,9 @@ class SetupOptions:
     )
     lens_model: str = option(
         'prior',
-        'lens model to estimate; prior: the model of the prior camera; auto, on the ground alone:'
-        ' the smallest model that leaves no significant residual field, as for images without'
-        ' attitudes and camera file; other models start from a fit to the prior camera',
+        'lens model to estimate; prior: the model of the prior camera; auto: the smallest model'
+        ' that leaves no significant residual field, as for images without attitudes and camera'
+        ' file; other models start from a fit to the prior camera',
         choices=('prior', 'auto', *LENSES),
     )
     prior_alignment: tuple[float, ...] = option(
@@ -401,16 +401,11 @@ def load_stated_setup(values: Mapping[str, object]) -> Setup:
     """
     The setup of a node on board, which finds no part of it by itself.
 
-    Raises as `load_setup`, and OptionError without a prior alignment, without a lens model, or for
-    a camera on the ground without a site.
+    Raises as `load_setup`, and OptionError without a prior alignment, or for a camera on the
+    ground without a site.
     """
     setup = load_setup(values)
     check_site(setup.site)
-    if setup.frames.lens_model == 'auto':
-        raise OptionError(
-            'lens_model: auto: starcal calibrate finds the model; give its camera_info.yaml as'
-            ' camera_info_url, and lens_model prior'
-        )
     if not setup.is_aligned:
         raise OptionError(
             'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'

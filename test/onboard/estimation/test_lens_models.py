@@ -15,7 +15,7 @@ from bench.narrow import bound_px, scenario_of
 from starcal_ground import calibrate
 from starcal_ground.comparison import map_error_px
 from starcal_ground.mission.export.camera_models import opencv_yaml
-from starcal_ground.mission.export.export_formats import Request
+from starcal_ground.mission.export.request import Request
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario, scenario
 from starcal_ros.arrays import Floats

@@ -20,13 +20,7 @@ from starcal_ros.errors import CatalogError, OptionError, ProductError
 from starcal_ros.options import names_of, option_fields
 from starcal_ros.pipeline import observe
 from starcal_ros.pipeline.detector_frames import DetectorFrames
-from starcal_ros.pipeline.setup import (
-    check_field_of_stars,
-    load_setup,
-    load_stated_setup,
-    OPTION_CLASSES,
-    Setup,
-)
+from starcal_ros.pipeline.setup import check_field_of_stars, load_setup, OPTION_CLASSES, Setup
 from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.image_model import CentroidOptions
@@ -35,26 +29,6 @@ from starcal_ros.stars.image_model import CentroidOptions
 @pytest.fixture(scope='module')
 def setup(camera_yaml: Path) -> Setup:
     return load_setup(values(camera_yaml))
-
-
-@pytest.mark.parametrize(
-    ('left_out', 'words'),
-    [
-        (
-            {'prior_alignment': 4 * [0.0]},
-            'prior_alignment: not given: starcal calibrate BAG finds',
-        ),
-        ({'lens_model': 'auto'}, 'lens_model: auto: starcal calibrate finds the model; give its'),
-        ({'observer': 'ground'}, 'observer: ground needs the site: set latitude_deg'),
-    ],
-)
-def test_a_node_on_board_finds_no_part_of_its_setup(
-    camera_yaml: Path, left_out: dict[str, object], words: str
-) -> None:
-    given = values(camera_yaml, **left_out)
-    load_setup(given)  # on the ground
-    with pytest.raises(OptionError, match=words):
-        load_stated_setup(given)
 
 
 def test_a_deep_catalog_need_not_cover_the_sky() -> None:
