@@ -13,7 +13,7 @@ from scipy.special import ndtri
 
 from starcal_ros.assessment.lookup import movement
 from starcal_ros.assessment.remedies import REMEDIES, remedy_against
-from starcal_ros.assessment.requirements import requirement_checks
+from starcal_ros.assessment.requirements import maps_of, requirement_checks
 from starcal_ros.estimation.limits import FALSE_ALARM_RATE
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import camera_at
@@ -260,9 +260,7 @@ def _fit(
     yield limit_check(options, 'max_rejected_fraction', name, found, remedy=remedy)
     name, remedy = 'number of images that fit', REMEDIES['stars']
     yield limit_check(estimation, 'min_images', name, images - misfits, remedy=remedy)
-    if calibration.maps is None:
-        raise ValueError('calibration: the gate needs its detector maps')
-    has_stars = calibration.maps.stars > 0
+    has_stars = maps_of(calibration).stars > 0
     found = float(has_stars.mean()) if has_stars.size else 0.0
     name, remedy = 'fraction of the detector with stars that fit', REMEDIES['coverage']
     yield limit_check(options, 'min_coverage', name, found, remedy=remedy)

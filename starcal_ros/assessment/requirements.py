@@ -80,7 +80,8 @@ class Quantity:
         return np.square(of_map) * self.of_camera + turned * self.of_alignment
 
 
-def _maps(calibration: Calibration) -> DetectorMaps:
+def maps_of(calibration: Calibration) -> DetectorMaps:
+    """Return the detector maps of a calibration; raises ValueError where it has none."""
     if calibration.maps is None:
         raise ValueError('calibration: the gate needs its detector maps')
     return calibration.maps
@@ -88,13 +89,13 @@ def _maps(calibration: Calibration) -> DetectorMaps:
 
 def _line_of_sight(calibration: Calibration, _: str) -> Floats:
     # Without an alignment the common rotation has no meaning.
-    maps, is_alone = _maps(calibration), not calibration.has_alignment
+    maps, is_alone = maps_of(calibration), not calibration.has_alignment
     return maps.shape_sigma_arcsec if is_alone else maps.line_of_sight_sigma_arcsec
 
 
 def _map(calibration: Calibration, unit: str) -> Floats | float:
     if unit == 'arcsec':
-        return _maps(calibration).shape_sigma_arcsec
+        return maps_of(calibration).shape_sigma_arcsec
     try:
         return map_sigma_px(calibration.geometry.camera, calibration.map_covariance)
     except np.linalg.LinAlgError:

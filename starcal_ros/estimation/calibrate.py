@@ -109,16 +109,10 @@ class Estimate:
     Attributes
     ----------
     geometry : CameraGeometry
-    covariance : (p + 3, p + 3)
-        Covariance of the p camera parameters and the alignment angles.
+    considered : (P, P)
+        Covariance of the shared unknowns, with that of camera parameters that are held.
     map_covariance : MapCovariance
-        The same with the coefficients of the field: that of lines of sight.
-    information : (k, k)
-        On the estimated camera parameters, focal terms, alignment and its rate, the images
-        eliminated; ``information_names`` are their names.
-    shared_covariance : (s, s)
-        Covariance of camera parameters, focal terms, alignment, rate and mountings, which are
-        ``shared_names``.
+        That of camera, alignment and field, on which lines of sight depend.
     linear : Linearisation
         The last one: the state is the one before the last step.
     sums : StarSums
@@ -149,12 +143,8 @@ class Estimate:
     """
 
     geometry: CameraGeometry
-    covariance: Floats
+    considered: Floats
     map_covariance: MapCovariance
-    information: Floats
-    information_names: tuple[str, ...]
-    shared_covariance: Floats
-    shared_names: tuple[str, ...]
     linear: Linearisation
     sums: StarSums
     posterior: Posterior
@@ -172,6 +162,12 @@ class Estimate:
     termination: str
     thermal: TemperatureTerms | None
     star_trackers: tuple[StarTrackerAlignment, ...]
+
+    @property
+    def covariance(self) -> Floats:
+        """Covariance (p + 3, p + 3) of the p camera parameters and the alignment angles."""
+        basic = self.linear.layout.of(['camera', 'alignment'])
+        return self.considered[np.ix_(basic, basic)]
 
 
 def estimate_calibration(
@@ -433,10 +429,7 @@ def _result(
     alignment = after.camera_from_star_tracker
     geometry = CameraGeometry(camera, canonical_xyzw(alignment.inv()))
     covariance = _considered(found, problem)
-    basic = layout.of(['camera', 'alignment'])
-    joint, shared = layout.line_of_sight_at, layout.in_state
-    names = tuple(layout.labels[k] for k in shared)
-    asked = np.intersect1d(shared, found.estimated)
+    joint = layout.line_of_sight_at
     chi2_given = squared_sigmas(residual_px[kept], table.covariance_px2[kept]).sum()
     trackers = attitudes.trackers
     noise = np.ones(3)
@@ -450,14 +443,10 @@ def _result(
     mountings = layout.of(['alignment', 'mountings'])
     return Estimate(
         geometry=geometry,
-        covariance=covariance[np.ix_(basic, basic)],
+        considered=covariance,
         map_covariance=MapCovariance(
             covariance[np.ix_(joint, joint)], math.sqrt(pixel_variance_px2(weights.errors))
         ),
-        information=found.equations.information[np.ix_(asked, asked)],
-        information_names=tuple(layout.labels[k] for k in asked),
-        shared_covariance=covariance[np.ix_(shared, shared)],
-        shared_names=names,
         linear=linear,
         sums=last.sums,
         posterior=found,

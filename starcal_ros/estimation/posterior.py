@@ -92,8 +92,6 @@ class Posterior:
         Shapes of the images.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
-    resolved : float
-        Number of unknowns that the data determine, those of images aside.
     log_evidence : float
         Log evidence of the data given the priors, up to a constant.
     layout : Layout
@@ -109,7 +107,6 @@ class Posterior:
     term: Amplitudes
     shapes: Shapes
     last_octave: tuple[Floats, Floats]
-    resolved: float
     log_evidence: float
     layout: Layout
     errors: ErrorParts | None = None
@@ -129,6 +126,12 @@ class Posterior:
         if self.errors is None:
             return total
         return np.asarray(total + self.errors.root @ self.errors.excess @ self.errors.root.T)
+
+    @property
+    def resolved(self) -> float:
+        """Number of shared unknowns that the data determine."""
+        part = np.ix_(self.estimated, self.estimated)
+        return float(np.einsum('ij,ji->', self.equations.information[part], self.working[part]))
 
     @property
     def of_images(self) -> Floats:
@@ -171,7 +174,6 @@ def posterior(
     log_px = np.log(found.sigma_px)
     log_evidence -= len(normal.c) * float(log_px.sum())
     log_evidence += float(LogPrior().log_density(log_px).sum())
-    resolved = solver.resolved(last, covariance)
     return Posterior(
         mean=mean,
         working=covariance,
@@ -181,7 +183,6 @@ def posterior(
         term=term,
         shapes=found,
         last_octave=last_octave,
-        resolved=resolved,
         log_evidence=log_evidence,
         layout=layout,
     )
@@ -295,11 +296,6 @@ class _Solver:
             + (np.log(precision[stated]) - precision[stated] * offset[stated] ** 2).sum()
         )
         return mean, covariance, (field.log_px, field.weight), field.term, log_evidence
-
-    def resolved(self, arrow: Equations, covariance: Floats) -> float:
-        """Return the number of shared unknowns that the data determine."""
-        part = np.ix_(self.estimated, self.estimated)
-        return float(np.einsum('ij,ji->', arrow.information[part], covariance[part]))
 
 
 def _shape_sums(

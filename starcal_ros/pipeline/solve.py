@@ -137,8 +137,10 @@ def calibration_of(
     """The estimate of an ensemble with its statistics and provenance, judged as by `judged`."""
     kept, camera = result.kept, result.geometry.camera
     field = camera.field
+    layout, found = result.linear.layout, result.posterior
+    searched, free = layout.in_state, np.intersect1d(layout.in_state, found.estimated)
     singular_values, weakest = observability.weakest_direction(
-        result.information, result.information_names
+        found.equations.information[np.ix_(free, free)], tuple(layout.labels[k] for k in free)
     )
     stamps_ns = [image.time_ns for image in ensemble.images]
     budget = sigma_budget(result, setup.calibration, has_alignment=setup.has_tracker)
@@ -178,7 +180,10 @@ def calibration_of(
         maps=observability.detector_maps(
             camera, result.map_covariance, result.table.measured_px[kept]
         ),
-        correlation=observability.correlation(result.shared_covariance, result.shared_names),
+        correlation=observability.correlation(
+            result.considered[np.ix_(searched, searched)],
+            tuple(layout.labels[k] for k in searched),
+        ),
         star_trackers=tuple(
             dataclasses.replace(tracker, frame=tracker.frame or setup.frames.star_tracker_frame)
             for tracker in result.star_trackers
