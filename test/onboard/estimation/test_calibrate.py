@@ -48,7 +48,8 @@ EIGHT = CalibrationOptions(
 NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
 ESTIMATED = [*FREE, 10, 11, 12]
-TRIALS = 60
+# The trials of the method hierarchical stand for those of per_image, as a test shows.
+TRIALS = {'hierarchical': 30, 'single': 16}
 each_method = pytest.mark.parametrize('method', METHODS)
 
 
@@ -105,7 +106,7 @@ def trial(method: str, k: int) -> Trial:
 
 
 def trials(method: str) -> tuple[Trial, ...]:
-    return tuple(trial(method, k) for k in range(TRIALS))
+    return tuple(trial(method, k) for k in range(TRIALS[method]))
 
 
 def assert_true_to_its_covariance(errors: list[float], parameters: int) -> None:
@@ -141,21 +142,29 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
     assert np.abs(found.residual_px).max() < 1e-8
 
 
-@each_method
-def test_the_order_of_the_names_does_not_matter(method: str) -> None:
+def test_the_order_of_the_names_does_not_matter() -> None:
     noisy = with_noise(clean(), 1, TRACKER_ARCSEC)
-    one, other = (estimated(noisy, method, estimate=order) for order in (NAMES, NAMES[::-1]))
+    one, other = trial('hierarchical', 1), estimated(noisy, 'hierarchical', estimate=NAMES[::-1])
     np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
+def test_hundreds_of_stars_leave_nothing_to_a_star_tracker_of_ten_arcsec() -> None:
+    """So that the trials of the method hierarchical are those of the method per_image as well."""
+    one, other = (trial(method, 0) for method in ('per_image', 'hierarchical'))
+    # Rounds stop at a step of a twentieth of a sigma; 390 stars place an image to 0.3 arcsec.
+    assert apart_sigma(one, other) < 0.05
+    assert sigma_of(one, FREE) == pytest.approx(sigma_of(other, FREE), rel=0.01)
+    assert sigma_of(one, [10, 11, 12]) == pytest.approx(sigma_of(other, [10, 11, 12]), rel=0.01)
+
+
 @pytest.mark.slow
-@each_method
+@pytest.mark.parametrize('method', TRIALS)
 def test_the_reported_covariance_is_true(method: str) -> None:
     """That of all, and those of the camera and of the alignment alone."""
     estimates = trials(method)
     assert {e.termination for e in estimates} == {'converged'}
-    for rows in (ESTIMATED, FREE, [10, 11, 12]) if method != 'single' else (ESTIMATED,):
+    for rows in (ESTIMATED, FREE, [10, 11, 12]):
         assert_true_to_its_covariance([chi2_of(e, rows) for e in estimates], len(rows))
     # Normal noise loses next to no star: 4.5 sigma of two dimensions is passed by 4e-5 of them.
     assert np.mean([e.rejected for e in estimates]) < 3.0
@@ -171,13 +180,19 @@ def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
     # A turn common to all pixels is the alignment's; what is left is the shape of the map.
     J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
     expected_px2 = np.einsum('ni,ij,nj->', J, bound, J) / len(J)
-    for method in ('per_image', 'hierarchical'):
-        errors = np.array([errors_of(e, TRUTH)[FREE] for e in trials(method)])
-        found_px2 = ((errors @ J.T) ** 2).mean()
-        # Some 8 independent modes in 60 trials: the ratio is known to 4 %.
-        assert 0.9 < np.sqrt(found_px2 / expected_px2) < 1.1
-        in_sigma = [normalised(error, bound) for error in errors]
-        assert_true_to_its_covariance(in_sigma, 8)
+    errors = np.array([errors_of(e, TRUTH)[FREE] for e in trials('hierarchical')])
+    found_px2 = ((errors @ J.T) ** 2).mean()
+    # Some 8 independent modes in 30 trials: the ratio is known to 5 %, and the interval is that
+    # of 99 % of chi squared, as below.
+    low, high = chi2.ppf([0.005, 0.995], 8 * len(errors)) / (8 * len(errors))
+    assert low < found_px2 / expected_px2 < high
+    assert_true_to_its_covariance([normalised(error, bound) for error in errors], 8)
+    # What is reported has no such chance: the field that stars cannot exclude adds a few percent.
+    reported_px2 = [
+        np.einsum('ni,ij,nj->', J, e.covariance[np.ix_(FREE, FREE)], J) / len(J)
+        for e in trials('hierarchical')
+    ]
+    assert 1.0 < np.sqrt(np.median(reported_px2) / expected_px2) < 1.1
 
 
 def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ensemble, list[Mask]]:
@@ -187,9 +202,7 @@ def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ens
     return moved, [np.asarray(one.any(axis=1)) for one in shifts]
 
 
-@pytest.mark.slow
-@each_method
-@pytest.mark.parametrize('fraction', [0.02, 0.10])
+@pytest.mark.parametrize(('method', 'fraction'), [('hierarchical', 0.02), ('single', 0.10)])
 def test_gross_outliers_are_left_out(method: str, fraction: float) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
     rng = np.random.default_rng(2)
@@ -226,21 +239,20 @@ def test_outliers_that_all_lean_one_way_are_left_out(method: str) -> None:
 
 
 @pytest.mark.slow
-@each_method
-@pytest.mark.parametrize('centroid_scale', [2.0, 0.5])
+@pytest.mark.parametrize(('method', 'centroid_scale'), [('hierarchical', 2.0), ('single', 0.5)])
 def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_scale: float) -> None:
     errors, factors = [], []
-    for k in range(10):
+    for k in range(6):
         noisy = with_noise(clean(), 100 + k, tracker_of(method), centroid_scale)
         found = estimated(noisy, method)
         errors.append(chi2_of(found))
         factors.append(found.variance_factor)
     assert_true_to_its_covariance(errors, 11)
-    # chi^2 per degree of freedom as given says it, to 0.6 % in 10 trials.
+    # chi^2 per degree of freedom as given says it, to 0.7 % in 6 trials; three of those.
     assert np.mean(factors) == pytest.approx(centroid_scale**2, rel=0.02)
 
 
-@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('method', ['hierarchical', 'single'])
 def test_an_image_that_loses_all_its_stars_spoils_nothing(method: str) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
     wrong = noisy.images[4]
@@ -303,7 +315,7 @@ def test_stars_in_one_spot_leave_an_honest_uncertainty(method: str) -> None:
 
 
 def test_an_estimate_is_settled_where_neither_unknowns_nor_sigmas_move() -> None:
-    found = estimate_calibration(with_noise(clean(), 1, TRACKER_ARCSEC), PRIOR, EIGHT).posterior
+    found = estimate_calibration(clean(), PRIOR, EIGHT).posterior
     sigma = np.sqrt(np.diag(found.covariance))
     still = dataclasses.replace(found, mean=0.01 * sigma)
     assert is_settled(still, found)
