@@ -49,18 +49,17 @@ def sharp() -> tuple[StarObservations, TrackedCamera]:
 
 
 @pytest.mark.parametrize(
-    'turn_rad',
+    ('turn_rad', 'tracked'),
     [
-        turned(3.0, 0.0, 0.0),
-        turned(0.0, 6.0, 0.0),
-        turned(4.5, -4.5, 0.0),
-        turned(9.5, 0.0, 0.0),
-        turned(0.0, 0.0, 8.0),
-        turned(3.0, 3.0, 6.0),
+        (turned(3.0, 0.0, 0.0), False),
+        (turned(4.5, -4.5, 0.0), True),
+        (turned(9.5, 0.0, 0.0), False),
+        (turned(0.0, 0.0, 8.0), True),
+        (turned(3.0, 3.0, 6.0), False),
+        (turned(3.0, 3.0, 6.0), True),
     ],
-    ids=['3 px', '6 px', 'diagonal', '9.5 px', 'roll', 'turn and roll'],
+    ids=['3 px', 'diagonal', '9.5 px', 'roll', 'turn and roll', 'turn and roll tracked'],
 )
-@pytest.mark.parametrize('tracked', [False, True])
 def test_streaks_are_measured_at_their_middle(turn_rad: Turn, tracked: bool) -> None:
     before, track = sharp()
     shown, image = exposed(turn_rad)
@@ -87,9 +86,8 @@ def test_few_bright_stars_show_the_streaks_of_a_tracked_image() -> None:
     assert len(image) > 20 and image.refused_stars.get('elongated', 0) < 3
 
 
-@pytest.mark.parametrize('length_px', [14.0, 25.0])
-def test_a_longer_streak_is_refused_with_its_length(length_px: float) -> None:
-    _, image = exposed(turned(length_px, 0.0, 0.0))
+def test_a_longer_streak_is_refused_with_its_length() -> None:
+    _, image = exposed(turned(14.0, 0.0, 0.0))
     with pytest.raises(ImageRefused, match=r'streaks of \d+ px, up to 10') as refused:
         observe_stars(image, SCENARIO.prior, SEARCH)
     assert refused.value.reason == 'smeared'
