@@ -292,11 +292,7 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
     [
         (['table2'], "invalid choice: 'table2'"),
         (['table1', '--trials', '0'], '--trials: 0 is not within 1 to'),
-        (['table1', '--seed', '-1'], '--seed: -1'),
-        (['table1', '--images', '1'], '--images: 1 is not within 2 to'),
-        (['table1', '--stars', '2'], '--stars: 2'),
         (['table1', '--tracker', 'nan'], 'nan is not within 0 to 3600'),
-        (['table1', '--tracker-assumed', '4000'], '4000 is not within'),
         (['table1', '--methods', 'all'], "--methods: invalid choice: 'all'"),
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
     ],

@@ -48,8 +48,8 @@ EIGHT = CalibrationOptions(
 NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
 ESTIMATED = [*FREE, 10, 11, 12]
-# The trials of the method hierarchical stand for those of per_image, as a test shows.
-TRIALS = {'hierarchical': 30, 'single': 16}
+# Number of trials of a method, and the true sigma of the centroids over the stated one.
+TRIALS = {'hierarchical': (30, 1.0), 'single': (16, 0.5), 'per_image': (8, 2.0)}
 each_method = pytest.mark.parametrize('method', METHODS)
 
 
@@ -69,18 +69,11 @@ def estimated(ensemble: Ensemble, method: str, **other: object) -> Estimate:
     return estimate_calibration(ensemble, PRIOR, options(method, **other))
 
 
-def chi2_of(estimate: Estimate | Trial, rows: list[int] = ESTIMATED) -> float:
-    return float(normalised_error(estimate, TRUTH, rows))
-
-
-def sigma_of(estimate: Estimate | Trial, rows: list[int]) -> Floats:
-    return np.asarray(np.sqrt(np.diag(estimate.covariance))[rows])
-
-
-def apart_sigma(one: Estimate, other: Estimate | Trial, rows: list[int] = ESTIMATED) -> float:
+def apart_sigma(one: Estimate, other: Estimate) -> float:
     """Largest difference of two estimates, in sigma of the second."""
     difference = errors_of(one, TRUTH) - errors_of(other, TRUTH)
-    return float(np.abs(difference[rows] / sigma_of(other, rows)).max())
+    sigma = np.sqrt(np.diag(other.covariance))
+    return float(np.abs(difference[ESTIMATED] / sigma[ESTIMATED]).max())
 
 
 def tracker_of(method: str) -> tuple[float, ...]:
@@ -96,17 +89,19 @@ class Trial:
     covariance: Floats
     termination: str
     rejected: int
+    variance_factor: float
 
 
 @functools.cache
-def trial(method: str, k: int) -> Trial:
-    found = estimated(with_noise(clean(), k, tracker_of(method)), method)
-    rejected = int(np.count_nonzero(~found.kept))
-    return Trial(found.geometry, found.covariance, found.termination, rejected)
-
-
 def trials(method: str) -> tuple[Trial, ...]:
-    return tuple(trial(method, k) for k in range(TRIALS[method]))
+    count, centroid_scale = TRIALS[method]
+    made = []
+    for k in range(count):
+        found = estimated(with_noise(clean(), k, tracker_of(method), centroid_scale), method)
+        rejected = int(np.count_nonzero(~found.kept))
+        numbers = found.termination, rejected, found.variance_factor
+        made.append(Trial(found.geometry, found.covariance, *numbers))
+    return tuple(made)
 
 
 def assert_true_to_its_covariance(errors: list[float], parameters: int) -> None:
@@ -144,30 +139,30 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
 
 def test_the_order_of_the_names_does_not_matter() -> None:
     noisy = with_noise(clean(), 1, TRACKER_ARCSEC)
-    one, other = trial('hierarchical', 1), estimated(noisy, 'hierarchical', estimate=NAMES[::-1])
+    one, other = (estimated(noisy, 'hierarchical', estimate=o) for o in (NAMES, NAMES[::-1]))
     np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
     np.testing.assert_array_equal(one.covariance, other.covariance)
-
-
-def test_hundreds_of_stars_leave_nothing_to_a_star_tracker_of_ten_arcsec() -> None:
-    """So that the trials of the method hierarchical are those of the method per_image as well."""
-    one, other = (trial(method, 0) for method in ('per_image', 'hierarchical'))
-    # Rounds stop at a step of a twentieth of a sigma; 390 stars place an image to 0.3 arcsec.
-    assert apart_sigma(one, other) < 0.05
-    assert sigma_of(one, FREE) == pytest.approx(sigma_of(other, FREE), rel=0.01)
-    assert sigma_of(one, [10, 11, 12]) == pytest.approx(sigma_of(other, [10, 11, 12]), rel=0.01)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize('method', TRIALS)
 def test_the_reported_covariance_is_true(method: str) -> None:
-    """That of all, and those of the camera and of the alignment alone."""
+    """
+    That of all, and those of the camera and of the alignment alone.
+
+    Centroid covariances that are stated wrong by four do no harm: their scale is estimated.
+    """
     estimates = trials(method)
     assert {e.termination for e in estimates} == {'converged'}
     for rows in (ESTIMATED, FREE, [10, 11, 12]):
-        assert_true_to_its_covariance([chi2_of(e, rows) for e in estimates], len(rows))
+        assert_true_to_its_covariance(
+            [normalised_error(e, TRUTH, rows) for e in estimates], len(rows)
+        )
     # Normal noise loses next to no star: 4.5 sigma of two dimensions is passed by 4e-5 of them.
     assert np.mean([e.rejected for e in estimates]) < 3.0
+    # 7,800 residuals give the scale to 1.6 %, 8 trials to 0.6 %; three of those.
+    factor, centroid_scale = np.mean([e.variance_factor for e in estimates]), TRIALS[method][1]
+    assert factor == pytest.approx(centroid_scale**2, rel=0.02)
 
 
 @pytest.mark.slow
@@ -202,54 +197,33 @@ def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ens
     return moved, [np.asarray(one.any(axis=1)) for one in shifts]
 
 
-@pytest.mark.parametrize(('method', 'fraction'), [('hierarchical', 0.02), ('single', 0.10)])
-def test_gross_outliers_are_left_out(method: str, fraction: float) -> None:
+def anywhere(k: int, n: int) -> Floats:
+    """One of ten stars, by 5 to 50 px."""
+    rng = np.random.default_rng([2, k])
+    far = rng.uniform(5, 50, n) * (rng.uniform(size=n) < 0.1)
+    angle = rng.uniform(0, 2 * np.pi, n)
+    return np.asarray(far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+def to_the_right(k: int, n: int) -> Floats:
+    """Two of five stars, all by 15 px: a mean is dragged along, a robust loss is not."""
+    moved = np.random.default_rng([5, k]).uniform(size=n) < 0.4
+    return np.asarray(np.outer(moved, [15.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ('method', 'shift'),
+    [('single', anywhere), ('hierarchical', to_the_right), ('per_image', to_the_right)],
+)
+def test_gross_outliers_are_left_out(method: str, shift: Callable[[int, int], Floats]) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
-    rng = np.random.default_rng(2)
-
-    def anywhere(_: int, n: int) -> Floats:
-        far = rng.uniform(5, 50, n) * (rng.uniform(size=n) < fraction)
-        angle = rng.uniform(0, 2 * np.pi, n)
-        return np.asarray(far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-
-    images, bad = spoilt(noisy, anywhere)
+    images, bad = spoilt(noisy, shift)
     found, moved = estimated(images, method), np.concatenate(bad)
     assert not found.kept[moved].any()
     assert np.count_nonzero(~found.kept[~moved]) <= 4
-    # The stars that are gone carried that fraction of the information: its root, in sigma, is by
-    # how much two such estimates differ, 0.14 or 0.32; the largest of eleven within four times.
-    assert apart_sigma(found, trial(method, 1)) < 4 * np.sqrt(fraction)
     # Against the minimum without those stars there is nothing left to excuse.
     without = tuple(one.select(~gone) for one, gone in zip(noisy.images, bad, strict=True))
     assert apart_sigma(found, estimated(Ensemble(without), method)) < 0.05
-
-
-@each_method
-def test_outliers_that_all_lean_one_way_are_left_out(method: str) -> None:
-    # Two of five stars, all 15 px to the right: a mean is dragged along, a robust loss is not.
-    def to_the_right(k: int, n: int) -> Floats:
-        moved = np.random.default_rng([5, k]).uniform(size=n) < 0.4
-        return np.asarray(np.outer(moved, [15.0, 0.0]))
-
-    images, bad = spoilt(with_noise(clean(), 1, tracker_of(method)), to_the_right)
-    found = estimated(images, method)
-    assert not found.kept[np.concatenate(bad)].any()
-    error = errors_of(found, TRUTH)[ESTIMATED]
-    assert np.abs(error / sigma_of(found, ESTIMATED)).max() < 5.0
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(('method', 'centroid_scale'), [('hierarchical', 2.0), ('single', 0.5)])
-def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_scale: float) -> None:
-    errors, factors = [], []
-    for k in range(6):
-        noisy = with_noise(clean(), 100 + k, tracker_of(method), centroid_scale)
-        found = estimated(noisy, method)
-        errors.append(chi2_of(found))
-        factors.append(found.variance_factor)
-    assert_true_to_its_covariance(errors, 11)
-    # chi^2 per degree of freedom as given says it, to 0.7 % in 6 trials; three of those.
-    assert np.mean(factors) == pytest.approx(centroid_scale**2, rel=0.02)
 
 
 @pytest.mark.parametrize('method', ['hierarchical', 'single'])
@@ -278,12 +252,9 @@ def test_too_few_are_counted_for_a_person() -> None:
         '(magnitude_limit, catalog)'
     )
     refused_too = Ensemble(clean().images[:2], {'no_match': 3, 'no_stars': 1})
-    with pytest.raises(TooFewObservations) as refused:
+    words = r'1 more image \(2 of 3 collected\) needed; 4 images refused; take more images$'
+    with pytest.raises(TooFewObservations, match=words):
         estimate_calibration(refused_too, PRIOR, CalibrationOptions())
-    assert str(refused.value) == (
-        'too few observations: 1 more image (2 of 3 collected) needed; 4 images refused; '
-        'take more images'
-    )
     check_enough(clean(), CalibrationOptions())
 
 

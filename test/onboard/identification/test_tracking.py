@@ -46,10 +46,9 @@ def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
     )
 
 
-def searched(
-    index: int, geometry: CameraGeometry = PRIOR
-) -> tuple[StarObservations, TrackedCamera]:
-    observations, known = started(exposure(index), geometry, SEARCH)
+@functools.cache
+def searched(index: int) -> tuple[StarObservations, TrackedCamera]:
+    observations, known = started(exposure(index), PRIOR, SEARCH)
     return observations, known
 
 
@@ -94,7 +93,7 @@ def test_an_ensemble_knows_its_light_better_than_an_image() -> None:
 @pytest.mark.slow
 def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
     errors = []
-    for seed in (8, 9, 10, 11):
+    for seed in (8, 9):
         given = scenario('tiny', seed=seed)
         detector = dataclasses.replace(
             given.detector, zero_point_electrons=2.5e4, psf_sigma_px=0.55, offset_dn=0.0
@@ -106,7 +105,7 @@ def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
             sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
             errors.append((observations.measured_px - one.pixel_px[nearest]) / sigma_px)
     of_sigma = np.concatenate(errors)
-    # 3,000 errors tell their RMS to 0.013.  A Gaussian for a PSF of half a pixel costs 0.04; with
+    # 1,500 errors tell their RMS to 0.018.  A Gaussian for a PSF of half a pixel costs 0.04; with
     # the small scatter of the pixels at 0 DN it was 1.13.
     assert float(np.sqrt((of_sigma**2).mean())) < 1.09
 
@@ -122,7 +121,7 @@ def test_stars_left_out_as_too_faint_are_listed_as_refused(
     count = len(used) + len(refused) - fainter // 2
     assert fainter > 100
     monkeypatch.setattr('starcal_ros.stars.detection.detectable_count', lambda *_: count)
-    part, _ = searched(1)
+    part, _ = started(exposure(1), PRIOR, SEARCH)
     assert part.catalog_id.tolist() == whole.catalog_id.tolist()
     assert set(part.refused_catalog_id) == set(whole.refused_catalog_id)
     # Light of the faint ones that the fits found is no longer subtracted.
@@ -154,7 +153,8 @@ def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
         fy=camera.intrinsics[2] * scale,
         k1=camera.distortion[0] + k1,
     )
-    _, known = searched(0, CameraGeometry(wrong, PRIOR.star_tracker_from_camera_xyzw))
+    geometry = CameraGeometry(wrong, PRIOR.star_tracker_from_camera_xyzw)
+    _, known = started(exposure(0), geometry, SEARCH)
     tracked, known = followed(exposure(1), known)
     assert len(tracked) > 0.95 * len(searched(1)[0])
     grid = pixel_grid(camera, 9, 7)
@@ -180,16 +180,15 @@ def test_noise_of_the_star_tracker_is_tracked() -> None:
     assert turn.magnitude() == pytest.approx(np.radians(0.5), rel=0.001)
 
 
-@pytest.mark.slow
 def test_a_drifting_alignment_is_tracked() -> None:
     _, known = searched(0)
     first = known.geometry
     focal_px = PRIOR.camera.intrinsics[0]
-    kept = []
+    kept, least = [], 0.95 * len(searched(1)[0])
     for turned_px in np.arange(0.0, 4.0, 0.4):
         before = known
         observations, known = followed(exposure(1, turned_px / focal_px), known)
-        assert len(observations) > 0.95 * len(searched(1)[0])
+        assert len(observations) > least
         kept.append(known.geometry is before.geometry)
     # Under a pixel nothing is corrected, as the next image finds its turn anyway; beyond it is.
     assert 4 <= kept.count(True) <= 8
@@ -211,7 +210,7 @@ def test_no_window_of_another_sky_is_believed() -> None:
             followed(dataclasses.replace(exposure(index), image=shown(other)[1]), known)
 
 
-@pytest.mark.parametrize('index', range(1, 10))
+@pytest.mark.parametrize('index', [1, 5, 9])
 def test_planets_are_no_stars(index: int) -> None:
     _, known = searched(0)
     one = shown(index)[0]

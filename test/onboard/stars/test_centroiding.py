@@ -317,15 +317,12 @@ def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, f
     ('dtype', 'step_dn', 'peak', 'count', 'expected'),
     [
         (np.uint8, 1, 255, 1, 0.98 * 255),
-        (np.uint8, 1, 254, 1, 0.0),
         (np.uint8, 1, 200, 4, 0.98 * 200),
-        (np.uint16, 1, 4095, 1, 0.98 * 4095),
         (np.uint16, 1, 65535, 1, 0.98 * 65535),
         (np.uint16, 257, 65535, 1, 0.98 * 65535),  # 8 bits
         (np.uint16, 16, 65520, 1, 0.98 * 65520),  # 12 bits in the high ones
         (np.uint16, 1, 65520, 1, 0.0),
         (np.uint16, 16, 4080, 1, 0.98 * 4080),  # 8 bits in the high ones of 12
-        (np.uint16, 1, 3000, 1, 0.0),
         (np.uint16, 1, 3000, 3, 0.0),
         (np.uint16, 1, 3000, 4, 0.98 * 3000),
     ],
