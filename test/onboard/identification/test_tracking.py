@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Tracking: the same stars as a search, or a lost track."""
+"""Tracking: the same stars as a search, or a lost track; streaks are measured at their middle."""
 
 from __future__ import annotations
 
@@ -15,11 +15,13 @@ from sample_sky import tracked as tracked_campaign
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from bench import narrow
+from bench.frames import load_set_up, observed, render_frame
 from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import scenario, Scene
+from starcal_ground.simulation.scenario import Detector, scenario, Scene
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
-from starcal_ros.identification.star_finder import Exposure, StarSearch
+from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
@@ -241,3 +243,88 @@ def test_the_saturation_that_images_before_have_shown(plateau: float, refused: i
     instrument = dataclasses.replace(known.instrument, saturation_dn=0.98 * plateau * peak)
     again, _ = followed(exposure(1), dataclasses.replace(known, instrument=instrument))
     assert again.refused_stars.get('saturated', 0) == refused
+
+
+FOCAL_PX = float(SCENARIO.truth.camera.parameters[0])
+CORNER_PX = 410.0
+Turn = tuple[float, float, float]  # rad, of an exposure
+SHARP: Turn = (0.0, 0.0, 0.0)
+LEAST = 0.45  # of the stars of a sharp image: streaks lie over each other and in their noise
+
+
+def turned(u_px: float, v_px: float, roll_px: float) -> Turn:
+    """Turn that moves stars by pixels in the middle and, by roll, in the corners."""
+    return v_px / FOCAL_PX, u_px / FOCAL_PX, roll_px / CORNER_PX
+
+
+@functools.cache
+def exposed(
+    turn_rad: Turn, index: int = 1, detector: Detector = SCENARIO.detector
+) -> tuple[Scene, Exposure]:
+    """Scene and image of a camera that turns during its exposure."""
+    moving = dataclasses.replace(SCENARIO, turn_rad=turn_rad, detector=detector)
+    one, image = exposure_of(moving, index)
+    return one, image
+
+
+@pytest.mark.parametrize(
+    ('turn_rad', 'tracked'),
+    [
+        (turned(3.0, 0.0, 0.0), False),
+        (turned(4.5, -4.5, 0.0), True),
+        (turned(9.5, 0.0, 0.0), False),
+        (turned(0.0, 0.0, 8.0), True),
+        (turned(3.0, 3.0, 6.0), False),
+        (turned(3.0, 3.0, 6.0), True),
+    ],
+    ids=['3 px', 'diagonal', '9.5 px', 'roll', 'turn and roll', 'turn and roll tracked'],
+)
+def test_streaks_are_measured_at_their_middle(turn_rad: Turn, tracked: bool) -> None:
+    before, track = searched(1)
+    one, image = exposed(turn_rad)
+    if tracked:
+        observations, after = track_stars(image, track, SEARCH)
+        # The next image may be sharp again.
+        assert after.instrument is track.instrument
+    else:
+        observations, _ = observe_stars(image, PRIOR, SEARCH)
+    assert len(observations) > LEAST * len(before)
+    error = errors_sigma(one, observations)
+    assert 0.85 < np.sqrt(np.mean(error**2)) < 1.15
+    # A bent path is no bias: the mean of some 100 stars is good to 0.1 sigma per axis.
+    assert np.abs(error.mean(axis=0)).max() < 0.35
+
+
+def test_few_bright_stars_show_the_streaks_of_a_tracked_image() -> None:
+    """Measured as sharp stars, most were refused as elongated."""
+    given = narrow.scenario_of(5.0, 1, 6.0)
+    set_up = load_set_up(given, prior_alignment_sigma_deg=0.01, magnitude_limit=9.0)
+    frames = (render_frame(given, index) for index in range(2))
+    image = observed(frames, set_up).images[1]
+    # Four stars are brighter than 15 sigma, twelve than 8.  As sharp ones: 8 used, 11 elongated.
+    assert len(image) > 20 and image.refused_stars.get('elongated', 0) < 3
+
+
+def test_a_longer_streak_is_refused_with_its_length() -> None:
+    _, image = exposed(turned(14.0, 0.0, 0.0))
+    with pytest.raises(ImageRefused, match=r'streaks of \d+ px, up to 10') as refused:
+        observe_stars(image, PRIOR, SEARCH)
+    assert refused.value.reason == 'smeared'
+
+
+@pytest.mark.parametrize('psf_sigma_px', [0.8, 1.4])
+def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> None:
+    _, track = searched(1)
+    detector = dataclasses.replace(SCENARIO.detector, psf_sigma_px=psf_sigma_px)
+    for index in (2, 3, 4):
+        _, track = track_stars(exposed(SHARP, index, detector)[1], track, SEARCH)
+
+
+def test_streaks_of_which_too_few_are_alone_are_searched_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    _, track = searched(1)
+    monkeypatch.setattr('starcal_ros.stars.image_model._ISOLATED_PX', 1000.0)
+    with pytest.raises(ImageRefused, match='too few of them are alone') as refused:
+        track_stars(exposed(turned(6.0, 0.0, 0.0))[1], track, SEARCH)
+    assert refused.value.reason == 'no_match'
