@@ -173,17 +173,17 @@ def test_results_and_their_table(study: str) -> None:
 
 def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
     """Table 1 of the paper; and hierarchical is as good as the better of the two."""
-    found = here(Design('table1', 4, (8,), (8, 80), tracker_arcsec=(0.0, 40.0), methods=METHODS))
+    found = here(Design('table1', 3, (8,), (8, 80), tracker_arcsec=(0.0, 40.0), methods=METHODS))
     for stars in (8, 80):
         cell = functools.partial(only, found.summary, stars=stars)
         noisy = {m: cell(tracker_arcsec=40.0, method=m) for m in METHODS}
-        # The bounds say 14 and 13 times; the rms of 4 trials of some 5 free directions of a map
-        # is known to 16 %.
+        # The bounds say 14 and 13 times; the rms of 3 trials of some 5 free directions of a map
+        # is known to 18 %.
         assert float(noisy['single']['map_px']) > 8 * float(noisy['per_image']['map_px'])
         for tracker in (0.0, 40.0):
             of = {m: float(cell(tracker_arcsec=tracker, method=m)['map_px']) for m in METHODS}
             # The errors are paired (same stars, same noise), but each method has its own
-            # estimated errors: what differs is under the scatter of 4 trials.
+            # estimated errors: what differs is under the scatter of 3 trials.
             assert of['hierarchical'] < 1.05 * min(of['per_image'], of['single'])
 
 
@@ -205,19 +205,19 @@ def test_hierarchical_gains_where_stars_are_few_and_the_star_tracker_good() -> N
 def test_errors_are_as_large_as_the_covariance_says() -> None:
     """With outliers; without any, test/onboard/estimation/test_calibrate.py has more trials."""
     methods, share = ('per_image', 'hierarchical'), monte_carlo.OUTLIER_SHARE
-    found = here(Design('coverage', 16, (16,), (80,), (20.0,), methods, (share,)))
+    found = here(Design('coverage', 10, (16,), (80,), (20.0,), methods, (share,)))
     for method in methods:
         row = only(found.summary, method=method)
-        low, high = chi2.ppf([0.005, 0.995], 11 * 16) / 16
+        low, high = chi2.ppf([0.005, 0.995], 11 * 10) / 10
         assert (row['low'], row['high']) == pytest.approx((low, high))
         # The field that stars cannot show and a slow error of the star tracker are in the sigma
         # and not in these trials: it is up to 15 % too large.
         assert low / 1.15**2 < float(row['normalised']) < high
-        # Of 16 trials the rms of the map is known to 8 %; three of those.
-        assert float(row['to_reported']) == pytest.approx(1.0, abs=0.24)
-        assert float(row['to_bound']) == pytest.approx(1.0, abs=0.24)
-        # The mean of 16 errors of one sigma: four of its own sigmas, for 11 of them.
-        assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(16)
+        # Of 10 trials the rms of the map is known to 10 %; three of those.
+        assert float(row['to_reported']) == pytest.approx(1.0, abs=0.3)
+        assert float(row['to_bound']) == pytest.approx(1.0, abs=0.3)
+        # The mean of 10 errors of one sigma: four of its own sigmas, for 11 of them.
+        assert abs(float(row['worst_bias_sigmas'])) < 4 / np.sqrt(10)
 
 
 def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:

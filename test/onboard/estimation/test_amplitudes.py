@@ -82,9 +82,8 @@ def test_a_stated_residual_of_the_lens_decides_where_the_data_do_not(
 
 
 @pytest.mark.parametrize('sigma_px', [(0.3, 0.1, 0.05), (0.05, 0.05, 0.0), (0.0, 0.2, 0.2)])
-@pytest.mark.parametrize('seed', [1, 2])
-def test_the_mode_is_that_of_the_dense_posterior(sigma_px: tuple[float, ...], seed: int) -> None:
-    made = field(np.random.default_rng(seed), np.array(sigma_px))
+def test_the_mode_is_that_of_the_dense_posterior(sigma_px: tuple[float, ...]) -> None:
+    made = field(np.random.default_rng(1), np.array(sigma_px))
     found = field_amplitudes(*made.sums)
     ratio = made.log_likelihood(np.exp(found.log_px)) - made.log_likelihood(np.zeros(3))
     # Unknowns whose information is under a millionth of their prior's are left out.
