@@ -305,7 +305,8 @@ def dense(given: Small) -> Dense:
     white = whitener(given.table.covariance_px2)
     white *= np.repeat(given.keep, 2)[:, None]
     steps = np.concatenate([shared_steps(given), np.tile(IMAGE_STEPS, IMAGES)])
-    stars, trackers = [], []
+    stars: list[Floats] = []
+    trackers: list[Floats] = []
     for k, step in enumerate(steps):
         if field.start <= k < field.stop:  # linear, and of the pixels alone
             stars.append(given.field_px(np.eye(field.stop - field.start)[k - field.start]).ravel())
