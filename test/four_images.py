@@ -301,12 +301,17 @@ class Dense:
 
 def dense(given: Small) -> Dense:
     """Return the derivatives of a small ensemble by finite differences."""
-    P = given.layout.count
+    P, field = given.layout.count, given.layout.places['field']
     white = whitener(given.table.covariance_px2)
     white *= np.repeat(given.keep, 2)[:, None]
     steps = np.concatenate([shared_steps(given), np.tile(IMAGE_STEPS, IMAGES)])
-    stars, trackers = [], []
+    stars: list[Floats] = []
+    trackers: list[Floats] = []
     for k, step in enumerate(steps):
+        if field.start <= k < field.stop:  # linear, and of the pixels alone
+            stars.append(given.field_px(np.eye(field.stop - field.start)[k - field.start]).ravel())
+            trackers.append(np.zeros(3 * IMAGES))
+            continue
 
         def unknowns(size: float, k: int = k) -> tuple[Floats, Floats]:
             z = np.zeros(len(steps))

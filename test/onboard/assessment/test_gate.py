@@ -122,95 +122,59 @@ def with_sigma(**sigma: float) -> np.ndarray:
     return np.diag(changed**2)
 
 
+def less_certain(by: str, low: float, high: float) -> dict[str, Any]:
+    """A part of the data that scatters by 1.5 of its predicted sigma."""
+    return with_model(predictions=(ResidualBin(by, low, high, 10000, 1.5, 0.005),))
+
+
 @pytest.mark.parametrize(
-    ('changes', 'limit', 'at_limit', 'beyond', 'start', 'remedy'),
+    ('changes', 'limit', 'at_limit', 'beyond', 'words'),
     [
         (
             {'stars_used': 90, 'stars_rejected': 10},
-            'max_rejected_fraction',
-            0.1,
-            0.099,
-            'fraction of stars left out as outliers is 0.1, over the limit of 0.099',
-            'look for smeared or misidentified stars (Residuals)',
+            *('max_rejected_fraction', 0.1, 0.099, 'stars .* smeared'),
         ),
-        (
-            {'maps': with_stars(half_covered())},
-            'min_coverage',
-            0.5,
-            0.51,
-            'fraction of the detector with stars that fit is 0.5, under the limit of 0.51',
-            'take images with stars in the empty cells (Coverage)',
-        ),
+        ({'maps': with_stars(half_covered())}, 'min_coverage', 0.5, 0.51, 'under .* empty cells'),
         (
             {'misfit_images_ns': (1, 2, 3, 4, 5, 6)},
-            'max_rejected_fraction',
-            0.3,
-            0.29,
-            'fraction of images whose attitude does not fit is 0.3, over the limit of 0.29',
-            'check their attitudes and stamps (Alignment)',
+            *('max_rejected_fraction', 0.3, 0.29, 'images .* stamps'),
         ),
         (
-            {},
-            'requirements',
-            (f'line_of_sight={SIGHT_ARCSEC}arcsec',),
-            ('line_of_sight=1.9arcsec',),
-            'largest 1-sigma of line_of_sight is 2 arcsec, over the limit of 1.9 arcsec',
-            (
-                'missed by 0.1 arcsec; state the velocity (topic, observer_velocity_m_s; '
-                'photographs: observer)'
-            ),
+            *({}, 'requirements', ('line_of_sight=2arcsec',), ('line_of_sight=1.9arcsec',)),
+            'largest 1-sigma of line_of_sight .*; missed by 0.1 arcsec; state the velocity',
         ),
         (
             with_model(step=DetectorStep('u', 320.4, 'v', -0.15, 1e-9)),
-            'max_detector_step_px',
-            0.15,
-            0.14,
-            'step of the detector in v at u = 320 is 0.15 px, over the limit of 0.14 px',
-            ('p-value < 0.000001; columns or rows are lost or shifted there: check the read-out'),
+            *('max_detector_step_px', 0.15, 0.14),
+            'in v at u = 320 is 0.15 px, .*; p-value < 0.000001; .* read-out',
         ),
         (
             with_model(image_variation_px=0.25),
-            'max_image_variation_px',
-            0.25,
-            0.2,
-            'change of the camera from image to image in a corner is 0.25 px, over the limit',
-            'use temperatures or one focus; unstated air (observer: ground) changes it',
-        ),
-        (
-            with_model(predictions=(ResidualBin('star', 5.0, 9.0, 10000, 1.5, 0.005),)),
-            'max_cross_validated_residual',
-            1.5,
-            1.25,
-            'residual over predicted sigma at star 5 to 9 is 1.5, over the limit of 1.25',
-            'the sigma is wrong there: check the PSF, the lens model or its images',
+            *('max_image_variation_px', 0.25, 0.2, 'in a corner .* one focus'),
         ),
         (
             {'star_trackers': (GOOD.star_trackers[0], drifting(80.0, 1e-6))},
-            'max_star_tracker_drift_arcsec',
-            80.0,
-            60.0,
-            'drift of the attitude of head_2 against the stars is 80 arcsec, over the limit',
-            'p-value 0.000001; leave it out of more_star_trackers, or use a shorter time',
+            *('max_star_tracker_drift_arcsec', 80.0, 60.0),
+            'of head_2 .*; p-value 0.000001; leave it out',
         ),
         (
-            # Images are numbered from one, as on the report.
-            with_model(predictions=(ResidualBin('image', 7.0, 9.0, 1000, 1.5, 0.01),)),
-            'max_cross_validated_residual',
-            1.5,
-            1.25,
-            'residual over predicted sigma at image 8 to 10 is 1.5, over',
-            'the sigma is wrong there: check the PSF, the lens model or its images',
+            less_certain('star', 5.0, 9.0),
+            *('max_cross_validated_residual', 1.5, 1.25, 'at star 5 to 9 .* the PSF'),
+        ),
+        (  # images are numbered from one, as on the report
+            less_certain('image', 7.0, 9.0),
+            *('max_cross_validated_residual', 1.5, 1.25, 'at image 8 to 10 .* the PSF'),
         ),
     ],
 )
 def test_each_limit_trips_alone(
-    changes: dict[str, Any], limit: str, at_limit: Any, beyond: Any, start: str, remedy: str
+    changes: dict[str, Any], limit: str, at_limit: Any, beyond: Any, words: str
 ) -> None:
-    # cx with a sigma of 2 px turns the lines of sight, and bends the map by little.
+    """The reason names what failed and what to do; its form is that of the next test."""
     found = dataclasses.replace(GOOD, **changes)
     assert reasons(found, GateOptions(**{limit: at_limit})) == ()
     (reason,) = reasons(found, GateOptions(**{limit: beyond}))
-    assert reason.startswith(start) and reason.endswith(f' ({limit}); {remedy}')
+    assert limits_in((reason,)) == [limit] and re.search(words, reason)
     assert len(reason) <= 200
 
 
@@ -222,36 +186,17 @@ VELOCITY = HeldTerm('velocity_x_m_s', 0.0, -6e4, 8000.0)
     [
         (
             HeldTerm('cx', 320.0, 323.0, 1.0),
-            {},
-            3.0,
-            (
-                '323 by the stars, 320 assumed; estimate it, or widen its prior (estimate,'
-                ' prior_sigma)'
-            ),
+            *({}, 3.0, '323 by the stars, 320 assumed; estimate it, or widen its prior'),
         ),
-        (
-            VELOCITY,
-            {},
-            7.5,
-            'the stars add -60000 to it; correct it so; on the ground state observer: ground',
-        ),
-        (
-            VELOCITY,
-            {'statements': ()},  # it was assumed
-            7.5,
-            ('none was received, that of the Earth was assumed; publish it, or check the date'),
-        ),
+        (VELOCITY, {}, 7.5, 'the stars add -60000 to it; correct it so'),
+        (VELOCITY, {'statements': ()}, 7.5, 'none was received, that of the Earth was assumed'),
         (
             HeldTerm('clock_offset_min', 0.0, -42.5, 5.0),
-            {},
-            8.5,
-            'the stars add -42.5 to it; check site and UTC, or state observer: ground alone',
+            *({}, 8.5, 'the stars add -42.5 to it; check site and UTC'),
         ),
         (
             HeldTerm('mounting of head_2 x_deg', 0.0, 20.0, 0.125),
-            {},
-            160.0,
-            'the stars add 20 to it; check more_alignments',
+            *({}, 160.0, 'the stars add 20 to it; check more_alignments'),
         ),
     ],
 )
@@ -261,7 +206,7 @@ def test_a_prior_that_the_stars_contradict_is_named(
     found = dataclasses.replace(GOOD, **with_model(held=(term,), **changes))
     assert reasons(found, GateOptions(max_held_term_sigma=sigmas)) == ()
     (reason,) = reasons(found, GateOptions(max_held_term_sigma=sigmas - 0.1))
-    assert reason == (
+    assert reason.startswith(
         f'distance of {term.name} from its assumed value is {sigmas:g} sigma, over the limit of'
         f' {sigmas - 0.1:g} sigma (max_held_term_sigma); {note}'
     )
@@ -277,19 +222,19 @@ OF_THE_PRIOR = {
     'max_rotation_deg': (np.degrees(0.03 * 640 / 1800), 13.0),
 }
 CHANGES = [
-    ('max_change_px', {'geometry': LONGER}, None, 3.916),
-    ('max_rotation_deg', {'geometry': TURNED_FAR}, None, 6.0),
-    ('max_change_px', {'geometry': LONGER}, GOOD, 3.916),
-    ('max_rotation_deg', {'geometry': TURNED}, GOOD, 0.2),
+    ('max_change_px', LONGER, None, 3.916, 'prior camera or lens_model does not match this lens'),
+    ('max_rotation_deg', TURNED_FAR, None, 6.0, 'check prior_alignment and the mounting'),
+    ('max_change_px', LONGER, GOOD, 3.916, 'find out if the camera has changed'),
+    ('max_rotation_deg', TURNED, GOOD, 0.2, 'find out if the mounting has changed'),
 ]
 
 
-@pytest.mark.parametrize(('limit', 'changes', 'active', 'expected'), CHANGES)
+@pytest.mark.parametrize(('limit', 'geometry', 'active', 'expected', 'remedy'), CHANGES)
 def test_each_limit_of_a_change_trips_alone(
-    limit: str, changes: dict[str, Any], active: Calibration | None, expected: float
+    limit: str, geometry: CameraGeometry, active: Calibration | None, expected: float, remedy: str
 ) -> None:
     """The value found is the expected one, and a limit on either side of it decides."""
-    found = dataclasses.replace(GOOD, **changes)
+    found = dataclasses.replace(GOOD, geometry=geometry)
     check = checks(found, GateOptions(), active)[limit]
     # The curvature of the field takes 4 % off the first; the others agree to 1e-3.
     assert check.found == pytest.approx(expected, rel=0.05)
@@ -300,14 +245,8 @@ def test_each_limit_of_a_change_trips_alone(
     at_limit, beyond = (GateOptions(**row) for row in limits)
     assert reasons(found, at_limit, active) == ()
     (reason,) = reasons(found, beyond, active)
-    assert reason.startswith(check.name) and f'({limit})' in reason
-    changed = {
-        ('max_change_px', True): 'the prior camera or lens_model does not match this lens',
-        ('max_change_px', False): 'find out if the camera has changed',
-        ('max_rotation_deg', True): 'check prior_alignment and the mounting',
-        ('max_rotation_deg', False): 'find out if the mounting has changed',
-    }
-    assert reason.endswith(changed[limit, active is None]) and len(reason) <= 200
+    assert reason.startswith(check.name) and limits_in((reason,)) == [limit]
+    assert reason.endswith(remedy) and len(reason) <= 200
     assert ('active calibration' in reason) == (active is not None)
 
 
@@ -398,7 +337,7 @@ def test_every_limit_has_its_check() -> None:
     assert 'p-value 0.7' in found['max_detector_step_px'].note
 
 
-@pytest.mark.parametrize('lens', [20.0, 50.0, 80.0, 100.0])
+@pytest.mark.parametrize('lens', [20.0, 100.0])
 def test_what_a_prior_may_be_off_by_is_no_reason_to_refuse(lens: float) -> None:
     """1.5 degrees and 5 degrees in roll (`prior_alignment`), and 3 % in the principal point."""
     f = 320 / np.tan(np.radians(lens / 2))

@@ -48,7 +48,8 @@ EIGHT = CalibrationOptions(
 NAMES = estimated_parameters(EIGHT, 'plumb_bob')
 FREE = [PARAMETER_NAMES.index(name) for name in NAMES]
 ESTIMATED = [*FREE, 10, 11, 12]
-TRIALS = 60
+# Number of trials of a method, and the true sigma of the centroids over the stated one.
+TRIALS = {'hierarchical': (30, 1.0), 'single': (16, 0.5), 'per_image': (8, 2.0)}
 each_method = pytest.mark.parametrize('method', METHODS)
 
 
@@ -68,18 +69,11 @@ def estimated(ensemble: Ensemble, method: str, **other: object) -> Estimate:
     return estimate_calibration(ensemble, PRIOR, options(method, **other))
 
 
-def chi2_of(estimate: Estimate | Trial, rows: list[int] = ESTIMATED) -> float:
-    return float(normalised_error(estimate, TRUTH, rows))
-
-
-def sigma_of(estimate: Estimate | Trial, rows: list[int]) -> Floats:
-    return np.asarray(np.sqrt(np.diag(estimate.covariance))[rows])
-
-
-def apart_sigma(one: Estimate, other: Estimate | Trial, rows: list[int] = ESTIMATED) -> float:
+def apart_sigma(one: Estimate, other: Estimate) -> float:
     """Largest difference of two estimates, in sigma of the second."""
     difference = errors_of(one, TRUTH) - errors_of(other, TRUTH)
-    return float(np.abs(difference[rows] / sigma_of(other, rows)).max())
+    sigma = np.sqrt(np.diag(other.covariance))
+    return float(np.abs(difference[ESTIMATED] / sigma[ESTIMATED]).max())
 
 
 def tracker_of(method: str) -> tuple[float, ...]:
@@ -95,17 +89,19 @@ class Trial:
     covariance: Floats
     termination: str
     rejected: int
+    variance_factor: float
 
 
 @functools.cache
-def trial(method: str, k: int) -> Trial:
-    found = estimated(with_noise(clean(), k, tracker_of(method)), method)
-    rejected = int(np.count_nonzero(~found.kept))
-    return Trial(found.geometry, found.covariance, found.termination, rejected)
-
-
 def trials(method: str) -> tuple[Trial, ...]:
-    return tuple(trial(method, k) for k in range(TRIALS))
+    count, centroid_scale = TRIALS[method]
+    made = []
+    for k in range(count):
+        found = estimated(with_noise(clean(), k, tracker_of(method), centroid_scale), method)
+        rejected = int(np.count_nonzero(~found.kept))
+        numbers = found.termination, rejected, found.variance_factor
+        made.append(Trial(found.geometry, found.covariance, *numbers))
+    return tuple(made)
 
 
 def assert_true_to_its_covariance(errors: list[float], parameters: int) -> None:
@@ -141,24 +137,32 @@ def test_without_noise_the_truth_comes_back(method: str, with_principal_point: b
     assert np.abs(found.residual_px).max() < 1e-8
 
 
-@each_method
-def test_the_order_of_the_names_does_not_matter(method: str) -> None:
+def test_the_order_of_the_names_does_not_matter() -> None:
     noisy = with_noise(clean(), 1, TRACKER_ARCSEC)
-    one, other = (estimated(noisy, method, estimate=order) for order in (NAMES, NAMES[::-1]))
+    one, other = (estimated(noisy, 'hierarchical', estimate=o) for o in (NAMES, NAMES[::-1]))
     np.testing.assert_array_equal(one.geometry.camera.parameters, other.geometry.camera.parameters)
     np.testing.assert_array_equal(one.covariance, other.covariance)
 
 
 @pytest.mark.slow
-@each_method
+@pytest.mark.parametrize('method', TRIALS)
 def test_the_reported_covariance_is_true(method: str) -> None:
-    """That of all, and those of the camera and of the alignment alone."""
+    """
+    That of all, and those of the camera and of the alignment alone.
+
+    Centroid covariances that are stated wrong by four do no harm: their scale is estimated.
+    """
     estimates = trials(method)
     assert {e.termination for e in estimates} == {'converged'}
-    for rows in (ESTIMATED, FREE, [10, 11, 12]) if method != 'single' else (ESTIMATED,):
-        assert_true_to_its_covariance([chi2_of(e, rows) for e in estimates], len(rows))
+    for rows in (ESTIMATED, FREE, [10, 11, 12]):
+        assert_true_to_its_covariance(
+            [normalised_error(e, TRUTH, rows) for e in estimates], len(rows)
+        )
     # Normal noise loses next to no star: 4.5 sigma of two dimensions is passed by 4e-5 of them.
     assert np.mean([e.rejected for e in estimates]) < 3.0
+    # 7,800 residuals give the scale to 1.6 %, 8 trials to 0.6 %; three of those.
+    factor, centroid_scale = np.mean([e.variance_factor for e in estimates]), TRIALS[method][1]
+    assert factor == pytest.approx(centroid_scale**2, rel=0.02)
 
 
 @pytest.mark.slow
@@ -171,13 +175,19 @@ def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
     # A turn common to all pixels is the alignment's; what is left is the shape of the map.
     J = J - turn @ np.linalg.lstsq(turn, J, rcond=None)[0]
     expected_px2 = np.einsum('ni,ij,nj->', J, bound, J) / len(J)
-    for method in ('per_image', 'hierarchical'):
-        errors = np.array([errors_of(e, TRUTH)[FREE] for e in trials(method)])
-        found_px2 = ((errors @ J.T) ** 2).mean()
-        # Some 8 independent modes in 60 trials: the ratio is known to 4 %.
-        assert 0.9 < np.sqrt(found_px2 / expected_px2) < 1.1
-        in_sigma = [normalised(error, bound) for error in errors]
-        assert_true_to_its_covariance(in_sigma, 8)
+    errors = np.array([errors_of(e, TRUTH)[FREE] for e in trials('hierarchical')])
+    found_px2 = ((errors @ J.T) ** 2).mean()
+    # Some 8 independent modes in 30 trials: the ratio is known to 5 %, and the interval is that
+    # of 99 % of chi squared, as below.
+    low, high = chi2.ppf([0.005, 0.995], 8 * len(errors)) / (8 * len(errors))
+    assert low < found_px2 / expected_px2 < high
+    assert_true_to_its_covariance([normalised(error, bound) for error in errors], 8)
+    # What is reported has no such chance: the field that stars cannot exclude adds a few percent.
+    reported_px2 = [
+        np.einsum('ni,ij,nj->', J, e.covariance[np.ix_(FREE, FREE)], J) / len(J)
+        for e in trials('hierarchical')
+    ]
+    assert 1.0 < np.sqrt(np.median(reported_px2) / expected_px2) < 1.1
 
 
 def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ensemble, list[Mask]]:
@@ -187,60 +197,36 @@ def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ens
     return moved, [np.asarray(one.any(axis=1)) for one in shifts]
 
 
-@pytest.mark.slow
-@each_method
-@pytest.mark.parametrize('fraction', [0.02, 0.10])
-def test_gross_outliers_are_left_out(method: str, fraction: float) -> None:
+def anywhere(k: int, n: int) -> Floats:
+    """One of ten stars, by 5 to 50 px."""
+    rng = np.random.default_rng([2, k])
+    far = rng.uniform(5, 50, n) * (rng.uniform(size=n) < 0.1)
+    angle = rng.uniform(0, 2 * np.pi, n)
+    return np.asarray(far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
+
+
+def to_the_right(k: int, n: int) -> Floats:
+    """Two of five stars, all by 15 px: a mean is dragged along, a robust loss is not."""
+    moved = np.random.default_rng([5, k]).uniform(size=n) < 0.4
+    return np.asarray(np.outer(moved, [15.0, 0.0]))
+
+
+@pytest.mark.parametrize(
+    ('method', 'shift'),
+    [('single', anywhere), ('hierarchical', to_the_right), ('per_image', to_the_right)],
+)
+def test_gross_outliers_are_left_out(method: str, shift: Callable[[int, int], Floats]) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
-    rng = np.random.default_rng(2)
-
-    def anywhere(_: int, n: int) -> Floats:
-        far = rng.uniform(5, 50, n) * (rng.uniform(size=n) < fraction)
-        angle = rng.uniform(0, 2 * np.pi, n)
-        return np.asarray(far[:, None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1))
-
-    images, bad = spoilt(noisy, anywhere)
+    images, bad = spoilt(noisy, shift)
     found, moved = estimated(images, method), np.concatenate(bad)
     assert not found.kept[moved].any()
     assert np.count_nonzero(~found.kept[~moved]) <= 4
-    # The stars that are gone carried that fraction of the information: its root, in sigma, is by
-    # how much two such estimates differ, 0.14 or 0.32; the largest of eleven within four times.
-    assert apart_sigma(found, trial(method, 1)) < 4 * np.sqrt(fraction)
     # Against the minimum without those stars there is nothing left to excuse.
     without = tuple(one.select(~gone) for one, gone in zip(noisy.images, bad, strict=True))
     assert apart_sigma(found, estimated(Ensemble(without), method)) < 0.05
 
 
-@each_method
-def test_outliers_that_all_lean_one_way_are_left_out(method: str) -> None:
-    # Two of five stars, all 15 px to the right: a mean is dragged along, a robust loss is not.
-    def to_the_right(k: int, n: int) -> Floats:
-        moved = np.random.default_rng([5, k]).uniform(size=n) < 0.4
-        return np.asarray(np.outer(moved, [15.0, 0.0]))
-
-    images, bad = spoilt(with_noise(clean(), 1, tracker_of(method)), to_the_right)
-    found = estimated(images, method)
-    assert not found.kept[np.concatenate(bad)].any()
-    error = errors_of(found, TRUTH)[ESTIMATED]
-    assert np.abs(error / sigma_of(found, ESTIMATED)).max() < 5.0
-
-
-@pytest.mark.slow
-@each_method
-@pytest.mark.parametrize('centroid_scale', [2.0, 0.5])
-def test_centroid_covariances_wrong_by_four_do_no_harm(method: str, centroid_scale: float) -> None:
-    errors, factors = [], []
-    for k in range(10):
-        noisy = with_noise(clean(), 100 + k, tracker_of(method), centroid_scale)
-        found = estimated(noisy, method)
-        errors.append(chi2_of(found))
-        factors.append(found.variance_factor)
-    assert_true_to_its_covariance(errors, 11)
-    # chi^2 per degree of freedom as given says it, to 0.6 % in 10 trials.
-    assert np.mean(factors) == pytest.approx(centroid_scale**2, rel=0.02)
-
-
-@pytest.mark.parametrize('method', METHODS)
+@pytest.mark.parametrize('method', ['hierarchical', 'single'])
 def test_an_image_that_loses_all_its_stars_spoils_nothing(method: str) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
     wrong = noisy.images[4]
@@ -266,12 +252,9 @@ def test_too_few_are_counted_for_a_person() -> None:
         '(magnitude_limit, catalog)'
     )
     refused_too = Ensemble(clean().images[:2], {'no_match': 3, 'no_stars': 1})
-    with pytest.raises(TooFewObservations) as refused:
+    words = r'1 more image \(2 of 3 collected\) needed; 4 images refused; take more images$'
+    with pytest.raises(TooFewObservations, match=words):
         estimate_calibration(refused_too, PRIOR, CalibrationOptions())
-    assert str(refused.value) == (
-        'too few observations: 1 more image (2 of 3 collected) needed; 4 images refused; '
-        'take more images'
-    )
     check_enough(clean(), CalibrationOptions())
 
 
@@ -303,7 +286,7 @@ def test_stars_in_one_spot_leave_an_honest_uncertainty(method: str) -> None:
 
 
 def test_an_estimate_is_settled_where_neither_unknowns_nor_sigmas_move() -> None:
-    found = estimate_calibration(with_noise(clean(), 1, TRACKER_ARCSEC), PRIOR, EIGHT).posterior
+    found = estimate_calibration(clean(), PRIOR, EIGHT).posterior
     sigma = np.sqrt(np.diag(found.covariance))
     still = dataclasses.replace(found, mean=0.01 * sigma)
     assert is_settled(still, found)

@@ -159,7 +159,7 @@ def test_mirrored_images_are_named() -> None:
         estimated(given, displaced(true_observations(given), mirrored))
 
 
-@pytest.mark.parametrize('field_deg', [0.3, 1.0, 2.5])
+@pytest.mark.parametrize('field_deg', [0.3, 2.5])
 def test_a_narrow_field_does_not_estimate_what_it_cannot_show(field_deg: float) -> None:
     """
     The higher orders stay at their prior, and the result is better than with all of them free.

@@ -144,21 +144,22 @@ def test_the_units_of_the_unknowns_do_not_matter() -> None:
     np.testing.assert_allclose(other.state * units, one.state, rtol=1e-13)
 
 
-def test_a_column_without_data_is_not_observable() -> None:
-    J = np.random.default_rng(4).normal(size=(20, 3))
-    J[:, 1] = 0.0
-    with pytest.raises(NotObservable, match='an unknown has no data'):
-        solve_arrow(plain(J, J[:, 0]), 0.0)
-
-
-def test_two_columns_alike_are_not_observable() -> None:
+@pytest.mark.parametrize(
+    ('factor', 'words'),
+    [
+        (np.zeros(20), 'an unknown has no data'),
+        (np.full(20, 1e6), 'cannot be separated'),
+        # Alike to 1e-9: positive definite by luck of rounding at best, and refused all the same.
+        (1e6 * (1 + 1e-9 * np.arange(20)), 'cannot be separated'),
+    ],
+    ids=['without data', 'alike', 'alike but for rounding'],
+)
+def test_a_column_that_says_nothing_of_its_own_is_not_observable(
+    factor: np.ndarray, words: str
+) -> None:
     J = np.random.default_rng(5).normal(size=(20, 3))
-    J[:, 2] = J[:, 1] * 1e6
-    with pytest.raises(NotObservable, match='cannot be separated'):
-        solve_arrow(plain(J, J[:, 0]), 0.0)
-    # Alike to 1e-9: positive definite by luck of rounding at best, and refused all the same.
-    J[:, 2] *= 1 + 1e-9 * np.arange(20)
-    with pytest.raises(NotObservable, match='cannot be separated'):
+    J[:, 2] = J[:, 1] * factor
+    with pytest.raises(NotObservable, match=words):
         solve_arrow(plain(J, J[:, 0]), 0.0)
 
 

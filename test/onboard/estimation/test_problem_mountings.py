@@ -111,8 +111,10 @@ def test_each_alignment_is_found(method: str) -> None:
 @pytest.mark.slow
 def test_the_covariance_of_alignments_and_mountings_is_true() -> None:
     squared, of_mountings = [], []
-    for seed in range(1, 31):
+    for seed in range(1, 17):
         given, ensemble = campaign(seed, [0, 1, 2] * 4, slow_arcsec=10.0)
+        # A hundred stars place an image ten times better than its star tracker does.
+        ensemble = Ensemble(tuple(i.select(np.arange(len(i)) % 5 == 0) for i in ensemble.images))
         trackers = estimated(given, ensemble, star_tracker_slow_arcsec=10.0).star_trackers
         errors = [error_rad(given, one, head) for head, one in enumerate(trackers)]
         for one, error in zip(trackers, errors, strict=True):
@@ -120,11 +122,11 @@ def test_the_covariance_of_alignments_and_mountings_is_true() -> None:
         for one, error in zip(trackers[1:], errors[1:], strict=True):
             apart = error - errors[0]
             of_mountings.append(apart @ np.linalg.solve(one.mounting_covariance_rad2, apart))
-    # Thirty campaigns of three correlated alignments: as at least 30 independent draws of chi^2 of
-    # 3, whose mean scatters by 0.45.  The sigma of the star tracker is estimated from 12 images,
-    # which makes the tails longer: four sigma.
-    assert abs(np.mean(squared) - 3.0) < 1.8
-    assert abs(np.mean(of_mountings) - 3.0) < 1.8
+    # Sixteen campaigns of three correlated alignments: as at least 16 independent draws of chi^2
+    # of 3.  The sigma of the star tracker is estimated from 12 images, which makes the tails
+    # longer: the interval of all but one in 500 of those means.
+    low, high = chi2.ppf([0.001, 0.999], 3 * 16) / 16
+    assert low < np.mean(squared) < high and low < np.mean(of_mountings) < high
 
 
 def test_a_star_tracker_that_drops_out_costs_nothing() -> None:
@@ -152,14 +154,13 @@ def test_without_images_of_the_first_its_alignment_has_the_sigma_of_the_mounting
     np.testing.assert_allclose(sigma_arcsec, 500.0, rtol=0.01)
 
 
-@pytest.mark.parametrize('heads', [[0, 1] * 18, [0, 1, 2] * 12])
-def test_a_star_tracker_that_drifts_is_named_and_loses_no_image(heads: list[int]) -> None:
+def test_a_star_tracker_that_drifts_is_named_and_loses_no_image() -> None:
     """240 arcsec over the campaign, 48 sigma of one image: no image is a misfit."""
-    given, ensemble = campaign(4, heads, np.array([240.0 / 36, 0.0, 0.0]))
+    given, ensemble = campaign(4, [0, 1, 2] * 12, np.array([240.0 / 36, 0.0, 0.0]))
     found = estimated(given, ensemble)
     assert found.termination == 'converged' and not found.misfit_image.any()
-    first, second, *others = found.star_trackers
-    for sound in (first, *others):
+    first, second, third = found.star_trackers
+    for sound in (first, third):
         assert sound.drift_p_value > 1e-4
     assert second.drift_p_value < 1e-9
     assert second.drift_arcsec == pytest.approx(240.0, abs=40.0)  # noise of 30 arcsec about z
@@ -172,9 +173,15 @@ def test_a_star_tracker_that_drifts_is_named_and_loses_no_image(heads: list[int]
     assert sigma_arcsec > 240.0 / np.sqrt(12.0)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize('heads', [[0, 1] * 6, [0, 1, 2] * 6, [0, 1, 1, 1] * 4])
-@pytest.mark.parametrize(('axis', 'degrees'), [('x', 1.0), ('x', 20.0), ('z', 90.0), ('y', 170.0)])
+@pytest.mark.parametrize(
+    ('heads', 'axis', 'degrees'),
+    [
+        ([0, 1] * 6, 'x', 1.0),
+        ([0, 1] * 6, 'y', 170.0),
+        ([0, 1, 2] * 6, 'z', 90.0),
+        ([0, 1, 1, 1] * 4, 'x', 20.0),
+    ],
+)
 def test_a_wrong_mounting_costs_no_image_and_is_named(
     heads: list[int], axis: str, degrees: float
 ) -> None:
@@ -188,13 +195,14 @@ def test_a_wrong_mounting_costs_no_image_and_is_named(
         # The prior of 300 arcsec pulls by the share of the information that is its.
         pull = np.trace(C) / (300.0 * ARCSECOND_RAD) ** 2 * np.radians(degrees)
         assert np.linalg.norm(error) < 5 * np.sqrt(np.trace(C)) + pull
-    off = [term for term in model_checks(found).held if term.name.startswith('mounting of head_1')]
+    checks = model_checks(found)
+    off = [term for term in checks.held if term.name.startswith('mounting of head_1')]
     assert len(off) == 3
     turn_deg = np.linalg.norm([term.estimated for term in off])
     # The other mountings are wrong by 270 arcsec too, and the pull is as above.
     assert turn_deg == pytest.approx(degrees, rel=0.04, abs=0.2)
     assert max(term.significance for term in off) > 5.0
-    refused = [one for one in model_gate(model_checks(found), GateOptions()) if not one.passed]
+    refused = [one for one in model_gate(checks, GateOptions()) if not one.passed]
     # At 170 degrees the prior pulls the alignment too, and other mountings with it.
     assert refused and 'mounting of head_1' in max(refused, key=lambda one: one.found).name
 

@@ -135,8 +135,10 @@ def brute(error: Floats, variance: float, is_stated: bool, stated_slow: float) -
     )
 
 
-@pytest.mark.parametrize(('is_stated', 'stated_slow'), [(True, 0.0), (False, 0.0), (True, 2.0)])
-@pytest.mark.parametrize(('seed', 'size'), [(1, 1.0), (2, 1.0), (3, 150.0)])
+@pytest.mark.parametrize(
+    ('seed', 'size', 'is_stated', 'stated_slow'),
+    [(1, 1.0, True, 0.0), (2, 1.0, False, 0.0), (2, 1.0, True, 2.0), (3, 150.0, True, 0.0)],
+)
 def test_the_posterior_is_the_dense_average_over_the_grid(
     seed: int, size: float, is_stated: bool, stated_slow: float
 ) -> None:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 
 import numpy as np
@@ -85,8 +84,8 @@ def test_the_pull_of_a_neighbour_is_that_of_the_fit(
 
 def test_what_is_left_of_a_pull_that_is_let_pass_is_under_its_sigma() -> None:
     worst = 0.0
-    for flux_dn, noise_dn in itertools.product((200.0, 500.0, 2000.0, 20000.0), (2.1, 10.0)):
-        for ratio in (0.01, 0.03, 0.1, 0.2, 0.3, 0.45):
+    for flux_dn, noise_dn in ((200.0, 10.0), (500.0, 2.1), (2000.0, 10.0), (20000.0, 2.1)):
+        for ratio in (0.01, 0.1, 0.2, 0.3, 0.45):
             for distance_px in np.arange(1.0, 8.0, 0.5).tolist():
                 pull_px, sigma_px, measured_dn = pull_of_a_neighbour(
                     flux_dn, ratio, distance_px, noise_dn
@@ -144,14 +143,14 @@ def test_no_neighbours_no_pulls() -> None:
 
 
 def excess_sigma2(deeper: bool) -> float:
-    """Mean square of the errors over their sigmas, of six images of which five are tracked."""
+    """Mean square of the errors over their sigmas, of four images of which three are tracked."""
     # The sky of the bundled catalog to V = 7, in pixels of 1.7 arcmin.
     catalog = load_catalog(None, 7.0)
     if not deeper:
         catalog = dataclasses.replace(catalog, deeper=None)
     search = StarSearch(catalog, identification=IdentificationOptions(magnitude_limit=7.0))
     squares = []
-    for shown, found, _ in tracked(scenario('tiny', seed=8), range(6), search):
+    for shown, found, _ in tracked(scenario('tiny', seed=8), range(4), search):
         assert np.isin(found.refused_catalog_id, catalog.id).all()
         squares.append(errors_sigma(shown, found) ** 2)
     return float(np.mean(np.concatenate(squares)))

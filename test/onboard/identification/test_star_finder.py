@@ -64,7 +64,7 @@ def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
     assert len(np.unique(found.catalog_id)) == len(found)
 
 
-@pytest.mark.parametrize('index', range(10))
+@pytest.mark.parametrize('index', [0, 3, 6, 9])
 def test_every_star_is_the_right_one(index: int) -> None:
     one, image = shown(index)
     found = observed(image, one.icrf_from_star_tracker_xyzw)
@@ -78,36 +78,36 @@ def test_every_star_is_the_right_one(index: int) -> None:
     np.testing.assert_allclose(np.linalg.norm(found.direction_icrf, axis=1), 1.0, rtol=1e-15)
 
 
-@pytest.mark.parametrize('tilt_deg', [0.1, 0.7, 1.45])
-@pytest.mark.parametrize('roll_deg', [-4.9, 0.0, 4.9])
-def test_an_alignment_that_launch_has_turned_is_acquired(tilt_deg: float, roll_deg: float) -> None:
-    for index in (0, 4, 8):
-        angle = np.random.default_rng(index).uniform(0, 2 * np.pi)
-        axis = np.array([np.cos(angle), np.sin(angle), 0.0])
-        turn = Rotation.from_rotvec(np.radians(tilt_deg) * axis) * Rotation.from_rotvec(
-            [0.0, 0.0, np.radians(roll_deg)]
-        )
-        one, image = shown(index)
-        found = observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn))
-        assert_right(found, one)
+@pytest.mark.parametrize(
+    ('index', 'tilt_deg', 'roll_deg'),
+    [(0, 0.1, -4.9), (4, 0.7, 0.0), (8, 1.45, 4.9), (4, 1.45, -4.9), (0, 1.45, 0.0)],
+)
+def test_an_alignment_that_launch_has_turned_is_acquired(
+    index: int, tilt_deg: float, roll_deg: float
+) -> None:
+    angle = np.random.default_rng(index).uniform(0, 2 * np.pi)
+    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
+    turn = Rotation.from_rotvec(np.radians(tilt_deg) * axis) * Rotation.from_rotvec(
+        [0.0, 0.0, np.radians(roll_deg)]
+    )
+    one, image = shown(index)
+    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn)), one)
 
 
-@pytest.mark.parametrize('scale', [0.98, 1.02])
-def test_a_focal_length_two_percent_off_is_acquired(scale: float) -> None:
+@pytest.mark.parametrize(('index', 'scale'), [(1, 0.98), (4, 1.02)])
+def test_a_focal_length_two_percent_off_is_acquired(index: int, scale: float) -> None:
     fx, _, fy, _, _ = PRIOR.camera.intrinsics
     camera = PRIOR.camera.replace(fx=scale * fx, fy=scale * fy)
     prior = dataclasses.replace(PRIOR, camera=camera)
-    for index in (1, 4):
-        one, image = shown(index)
-        assert_right(observed(image, one.icrf_from_star_tracker_xyzw, prior), one)
+    one, image = shown(index)
+    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, prior), one)
 
 
-@pytest.mark.slow
 def test_a_wrong_attitude_never_matches() -> None:
-    # Anywhere in the sky: that one of 100 comes within 1.5 degrees is a chance of 0.02.
-    for index in range(5):
+    # Anywhere in the sky: that one of 40 comes within 1.5 degrees is a chance of 0.01.
+    for index in range(4):
         _, image = shown(index)
-        for seed in range(20):
+        for seed in range(10):
             attitude = Rotation.random(random_state=100 * index + seed).as_quat()
             with pytest.raises(ImageRefused) as refusal:
                 observed(image, attitude)
@@ -135,8 +135,7 @@ def test_hot_pixels_and_missing_and_strange_stars() -> None:
     assert len(found) > 80 and (off_px < 1.0).mean() > 0.98
 
 
-@pytest.mark.parametrize('index', range(10))
-@pytest.mark.parametrize('turn_deg', [0.0, 1.0], ids=['near', 'searched'])
+@pytest.mark.parametrize(('index', 'turn_deg'), [(0, 0.0), (4, 0.0), (2, 1.0), (7, 1.0)])
 def test_planets_are_no_stars(index: int, turn_deg: float) -> None:
     one, _ = shown(index)
     image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
@@ -211,10 +210,10 @@ def noise(sky: np.ndarray, seed: int) -> np.ndarray:
     [
         (lambda sky: np.zeros_like(sky), ['no_stars']),
         (lambda sky: np.full_like(sky, 4095), ['no_stars']),
-        *((functools.partial(noise, seed=k), ['no_stars', 'no_match']) for k in range(5)),
+        *((functools.partial(noise, seed=k), ['no_stars', 'no_match']) for k in range(2)),
         (lambda sky: sky[:, ::-1].copy(), ['no_match']),
     ],
-    ids=['dark', 'bright', *map('noise {}'.format, range(5)), 'mirrored'],
+    ids=['dark', 'bright', *map('noise {}'.format, range(2)), 'mirrored'],
 )
 def test_an_image_without_the_stars_matches_nothing(
     made_of: Callable[[np.ndarray], np.ndarray], refusals: list[str]

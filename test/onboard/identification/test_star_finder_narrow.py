@@ -78,9 +78,7 @@ def wrong(found: StarObservations, one: Scene) -> int:
     [
         (0.3, 5 / 3600, 5 / 3600),
         (0.3, 0.3, 0.3),
-        (0.3, 1.0, 0.5),
         (1.0, 120 / 3600, 0.5),
-        (1.0, 1.0, 0.5),
         (2.5, 1.0, 0.5),
     ],
 )
@@ -211,7 +209,7 @@ def test_a_site_that_has_an_image_below_its_horizon_is_named() -> None:
         observe_stars(Exposure(image, attitude_xyzw, 0.5, site=away), geometry, search)
 
 
-@pytest.mark.parametrize('field_deg', [0.3, 1.0, 2.5])
+@pytest.mark.parametrize('field_deg', [0.3, 2.5])
 def test_stars_are_found_without_attitude_in_the_region_of_the_catalog(field_deg: float) -> None:
     camera, catalog = given(field_deg).prior.camera, sky_of(field_deg)
     fx = 0.9 * float(camera.parameters[0])

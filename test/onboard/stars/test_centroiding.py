@@ -54,8 +54,9 @@ def field(
     return found.xy_px - xy, found, bound[:, [0, 1], [0, 1]], snr
 
 
-@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
-@pytest.mark.parametrize('bits', [8, 12])
+@pytest.mark.parametrize(
+    ('psf_sigma_px', 'bits'), [(0.7, 8), (0.7, 12), (0.95, 12), (1.3, 8), (2.0, 12)]
+)
 def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)
     if bits == 8:  # the same stars on 256 steps: 16000 electrons peak at 3100
@@ -78,10 +79,15 @@ def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) ->
 
 
 @pytest.mark.parametrize(
-    ('psf_sigma_px', 'tail_px', 'part'),
-    [(0.95, 0.0, 0.25), (0.7, 2.0, 0.25), (0.7, 2.5, 0.12), (0.95, 2.5, 0.12), (0.95, 3.0, 0.2)],
+    ('psf_sigma_px', 'tail_px', 'part', 'brightest'),
+    [
+        (0.95, 0.0, 0.25, 5.3),
+        (0.7, 2.0, 0.25, 6.3),
+        (0.7, 2.5, 0.12, 5.3),
+        (0.95, 2.5, 0.12, 6.3),
+        (0.95, 3.0, 0.2, 5.3),
+    ],
 )
-@pytest.mark.parametrize('brightest', [5.3, 6.3])
 def test_stars_of_one_shape_are_measured_and_another_shape_is_refused(
     psf_sigma_px: float, tail_px: float, part: float, brightest: float
 ) -> None:
@@ -109,7 +115,7 @@ def bias_with_phase_px(error_px: np.ndarray, xy: np.ndarray) -> np.ndarray:
     return np.asarray(np.bincount(bins, error_px.ravel()) / np.bincount(bins))
 
 
-@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 1.3, 2.0])
+@pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 2.0])
 def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
     # So bright (16 bit) that a single centroid is good to 1.5e-3 sigma.
     detector = dataclasses.replace(
@@ -226,12 +232,12 @@ def test_all_stars_above_eight_sigma_are_detected() -> None:
     assert total > 1500 and found_all > 0.998 * total
 
 
-@pytest.mark.parametrize(('threshold', 'images'), [(3.5, 3), (5.0, 20)])
+@pytest.mark.parametrize(('threshold', 'images'), [(3.5, 2), (4.5, 6)])
 def test_noise_alone_gives_no_more_detections_than_it_should(
     threshold: float, images: int
 ) -> None:
     # Local maxima of a Gaussian field above t sigma: (2 pi)^-3/2 L t exp(-t^2 / 2) per pixel with
-    # L = 1 / (2 s^2) of the filter: 80 per image at 3.5 sigma, 0.2 at 5.
+    # L = 1 / (2 s^2) of the filter: 80 per image at 3.5 sigma, 2 at 4.5.
     density = (2 * np.pi) ** -1.5 * 0.5 * threshold * np.exp(-0.5 * threshold**2)
     expected = density * SHAPE[0] * SHAPE[1] * images
     detector = dataclasses.replace(QUIET, electrons_per_dn=1.0, offset_dn=100.0)
@@ -239,7 +245,7 @@ def test_noise_alone_gives_no_more_detections_than_it_should(
     for seed in range(images):
         pixels = expose(np.full(SHAPE, 4.5), detector, np.random.default_rng([seed, 6]))
         count += len(detect(pixels, measure_background(pixels), threshold).snr)
-    # Poisson; the noise, 1 % off, changes the count by 12 % at 3.5 sigma and 25 % at 5.
+    # Poisson; the noise, 1 % off, changes the count by 12 % at 3.5 sigma and 20 % at 4.5.
     assert count < 1.25 * expected + 3 * np.sqrt(expected)
     assert count > 0.75 * expected - 3 * np.sqrt(expected)
 
@@ -287,7 +293,7 @@ def test_a_saturated_star_is_refused(options: CentroidOptions) -> None:
     assert measured(pixels, place, none).refusal[0] == StarRefusal.SATURATED
 
 
-@pytest.mark.parametrize('off', [(0.4, 0.4), (-0.4, 0.4), (0.4, -0.4)])
+@pytest.mark.parametrize('off', [(0.4, 0.4), (-0.4, -0.4)])
 def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, float]) -> None:
     """
     The star is measured by what is left of it: its full flux, as well as its covariance states.
@@ -311,15 +317,12 @@ def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, f
     ('dtype', 'step_dn', 'peak', 'count', 'expected'),
     [
         (np.uint8, 1, 255, 1, 0.98 * 255),
-        (np.uint8, 1, 254, 1, 0.0),
         (np.uint8, 1, 200, 4, 0.98 * 200),
-        (np.uint16, 1, 4095, 1, 0.98 * 4095),
         (np.uint16, 1, 65535, 1, 0.98 * 65535),
         (np.uint16, 257, 65535, 1, 0.98 * 65535),  # 8 bits
         (np.uint16, 16, 65520, 1, 0.98 * 65520),  # 12 bits in the high ones
         (np.uint16, 1, 65520, 1, 0.0),
         (np.uint16, 16, 4080, 1, 0.98 * 4080),  # 8 bits in the high ones of 12
-        (np.uint16, 1, 3000, 1, 0.0),
         (np.uint16, 1, 3000, 3, 0.0),
         (np.uint16, 1, 3000, 4, 0.98 * 3000),
     ],
@@ -426,8 +429,10 @@ def test_a_star_with_lit_pixels_in_its_core_is_refused(lit: list[tuple[int, int,
     assert measured(pixels, place).refusal[0] == StarRefusal.ELONGATED
 
 
-@pytest.mark.parametrize(('flux', 'lit'), [(3000.0, 2e4), (2e5, 3000.0)])
-@pytest.mark.parametrize('away', [(2, 0), (-2, 1), (-1, -2)])
+@pytest.mark.parametrize(
+    ('away', 'flux', 'lit'),
+    [((2, 0), 3000.0, 2e4), ((-2, 1), 2e5, 3000.0), ((-1, -2), 3000.0, 2e4)],
+)
 def test_a_star_beside_a_single_lit_pixel_is_measured(
     away: tuple[int, int], flux: float, lit: float
 ) -> None:
@@ -497,8 +502,7 @@ def test_the_fit_itself_is_exact_on_its_own_model() -> None:
 @pytest.mark.parametrize(
     ('seed', 'min_snr', 'detector'),
     [
-        *((seed, 5.0, dataclasses.replace(QUIET, psf_sigma_px=0.95)) for seed in range(4)),
-        *((4, 5.0, dataclasses.replace(QUIET, psf_sigma_px=width)) for width in (0.5, 0.7, 2.0)),
+        *((4, 5.0, dataclasses.replace(QUIET, psf_sigma_px=width)) for width in (0.5, 0.95, 2.0)),
         *((5, min_snr, QUIET) for min_snr in (2.0, 30.0)),
         (6, 5.0, Detector(cosmic_rays=500.0, hot_fraction=1e-2)),
     ],
@@ -525,8 +529,9 @@ def test_the_fit_that_a_faint_star_is_spared_changes_nothing(
     assert len(xy) - len(spared.fitted) > 0.33 * faint
 
 
-@pytest.mark.parametrize('longest_px', [0.0, 10.0])
-@pytest.mark.parametrize(('flux_snr', 'min_snr'), [(5.5, 5.0), (6.5, 5.0), (25.0, 20.0)])
+@pytest.mark.parametrize(
+    ('longest_px', 'flux_snr', 'min_snr'), [(0.0, 5.5, 5.0), (10.0, 6.5, 5.0), (10.0, 25.0, 20.0)]
+)
 def test_no_star_above_the_limit_is_surely_fainter(
     longest_px: float, flux_snr: float, min_snr: float
 ) -> None:

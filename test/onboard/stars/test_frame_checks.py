@@ -60,7 +60,7 @@ def known(pixels: Pixels, time_ns: int = 0) -> Fingerprint:
     return fingerprint(Image(time_ns, pixels), sample_rows(pixels))
 
 
-@pytest.mark.parametrize('index', range(SCENARIO.image_count))
+@pytest.mark.parametrize('index', [0, 1, 5])
 def test_sound_frames_pass(index: int) -> None:
     before = known(frame(index - 1)) if index else None
     assert refusal(frame(index), before) == ''
@@ -208,8 +208,7 @@ def test_a_corona_is_no_glare() -> None:
     assert refusal(corona()) == ''
 
 
-@pytest.mark.parametrize('quality', [60, 75])
-@pytest.mark.parametrize('offset_dn', [-20, 0, 20])
+@pytest.mark.parametrize(('quality', 'offset_dn'), [(60, -20), (60, 20), (75, 0)])
 def test_a_compressed_sky_is_complete(quality: int, offset_dn: int) -> None:
     """JPEG leaves blocks without noise, and rows of blocks that are equal."""
     bytes_ = np.clip(frame().astype(np.int64) + offset_dn, 0, 255).astype(np.uint8)
