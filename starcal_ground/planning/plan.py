@@ -268,9 +268,7 @@ def _rows(
         of_tracker, of_shape = np.split(np.arange(stars, stars + b), [IMAGE_ROTATION.stop])
         shared[:, of_tracker[:, None], turning] = -J[chunk.image] @ turns[chunk.image]
         own[:, of_tracker, IMAGE_ROTATION] = J[chunk.image]
-        own[:, of_shape, layout.places['shape']] = np.diag(
-            1.0 / estimate.posterior.shapes.sigma_px
-        )
+        own[:, of_shape, layout.shape_at] = np.diag(1.0 / estimate.posterior.shapes.sigma_px)
         Q = np.linalg.qr(own)[0]
         yield chunk.image, place, shared - Q @ (Q.transpose(0, 2, 1) @ shared)
 

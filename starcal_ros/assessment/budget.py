@@ -274,7 +274,7 @@ def _of_unknowns(
             continue
         entry = layout[names[0]]
         text = entry.kind.assumption(layout, found.mean, options)
-        if cause == 'field':
+        if entry is layout.field:
             text = _estimated(_field_px(estimate), found.field.likelihood_ratio)
         yield _part(cause, _gain(errors, _known(errors, estimate, names), seen), text)
 

@@ -97,7 +97,7 @@ def _at_most_likely(estimate: Estimate) -> tuple[Indices, Floats, Floats]:
     """Return unknowns (d,), means (P,) of all and information (d, d) at the best amplitudes."""
     posterior, layout = estimate.posterior, estimate.linear.layout
     given = posterior.equations
-    entry, field = layout['field'], layout.field_at
+    entry, field = layout.field, layout.field_at
     assert entry.octave is not None and entry.term is not None
     sigma_px = entry.sigma * np.exp(posterior.field.log_px)[entry.octave]
     term, precision = np.zeros(layout.count), layout.prior_precision.copy()

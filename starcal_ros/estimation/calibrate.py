@@ -73,6 +73,7 @@ from starcal_ros.estimation.unknowns import (
     IMAGE_ROTATION,
     Layout,
     moved,
+    readout_rms_s,
     unknowns_of,
 )
 from starcal_ros.estimation.weights import (
@@ -287,7 +288,9 @@ def _round(
     problem = weighted_attitudes(problem, data, judged.attitudes, state)
     size = camera.width, camera.height
     near = before.posterior if before else None
-    readout_s = _readout_rms_s(data.assumed, near)
+    readout_s = math.hypot(*data.assumed.readout_s)
+    if near:
+        readout_s = readout_rms_s(near.layout, near.mean, near.working, data.assumed)
     rates = data.rates.turned(state.camera_from_star_tracker, readout_s)
     layout = unknowns_of(EntryInputs(problem, state, rates, size, data.assumed))
     measurements = arrange(table, judged.kept, judged.working_px2)
@@ -304,14 +307,6 @@ def _round(
     freedom = degrees_of_freedom(found, linear, table, judged.kept)
     attitudes = tracker_attitudes(data, linear, sums, taken, after, judged.attitudes)
     return _Round(linear, sums, found, after, left_px, freedom, attitudes)
-
-
-def _readout_rms_s(assumed: Assumptions, near: Posterior | None) -> float:
-    """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
-    if near is None or not {'rates', 'readout'} <= set(near.layout.places):
-        return math.hypot(*assumed.readout_s)
-    at = near.layout.places['readout'].start
-    return math.hypot(near.mean[at], near.working[at, at] ** 0.5)
 
 
 def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:

@@ -148,7 +148,7 @@ def star_rows(
     layout = linear.layout
     E = chain(linear.problem, layout, linear.measurements.image_count).transpose(0, 2, 1)
     at, field = seen_by_stars(layout), layout.field_at
-    functions = layout['field'].functions
+    functions = layout.field.functions
     assert functions is not None
     (seen, to), (of_u, to_u), (of_v, to_v) = (
         (places := np.flatnonzero(np.isin(of, part)), np.searchsorted(part, of[places]))
@@ -190,7 +190,7 @@ def weighted_rows_by(
     layout = linear.layout
     E, at = chain(linear.problem, layout, linear.measurements.image_count), seen_by_stars(layout)
     by_root = E[:, :, : len(at)] @ root[at] + E[:, :, len(at) : -1] @ of_images
-    functions, r = layout['field'].functions, root.shape[1]
+    functions, r = layout.field.functions, root.shape[1]
     assert functions is not None
     of_field = np.concatenate(np.split(root[layout.field_at], 2), axis=1)
     for chunk, Z in star_columns(linear):

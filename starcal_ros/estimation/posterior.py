@@ -156,7 +156,7 @@ def posterior(
         At a state near this one: the search of amplitudes begins with its own.
     """
     layout = linear.layout
-    before = np.broadcast_to(before, len(layout['shape']))
+    before = np.broadcast_to(before, len(layout.shape))
     normal = arrow(sums, linear.problem, linear.state, layout)
     start = without_images(normal, layout, before)
     solver = _Solver(layout)
@@ -239,7 +239,7 @@ class _Solver:
         self.field = layout.field_at
         self.free = np.setdiff1d(np.flatnonzero(np.isfinite(self.precision)), self.field)
         self.estimated = np.concatenate([self.free, self.field])
-        field = layout['field']
+        field = layout.field
         assert field.octave is not None and field.term is not None
         self.unit, self.octave, self.term = field.sigma, field.octave, field.term / field.sigma
         self.first = field.log_px
@@ -316,13 +316,13 @@ def _shape_sums(
     others = columns[rotation]
     weak = np.where(size > 0, 1e-9 * size, 1.0)[:, None] * np.ones(3)
     for entry in layout.of_image:
-        if entry.name != 'shape':
+        if entry is not layout.shape:
             others = np.concatenate([others, columns[own][layout.places[entry.name]]])
             weak = np.concatenate([weak, np.tile(entry.sigma**-2.0, (len(weak), 1))], axis=1)
     C = blocks[:, others[:, None], others] + weak[:, :, None] * np.eye(len(others))
     back = np.linalg.solve(C, blocks[:, others])
     left = blocks - blocks[:, others].transpose(0, 2, 1) @ back
-    shape, total = columns[own][layout.places['shape']], left.sum(axis=0)
+    shape, total = columns[own][layout.shape_at], left.sum(axis=0)
     at = seen_by_stars(layout)  # the first columns
     precision, offset = solver.precision[at], layout.prior_offset[at]
     free = np.flatnonzero(np.isfinite(precision) & ~np.isin(at, layout.trend_at))
@@ -338,7 +338,7 @@ def _shape_sums(
 
 def common_shape(layout: Layout, common_px2: Floats) -> Floats:
     """Return the covariance (P, P) of the shapes that all images share, by the camera."""
-    camera, shapes = layout.places['camera'], layout['shape'].camera
+    camera, shapes = layout.places['camera'], layout.shape.camera
     assert shapes is not None
     free = np.isfinite(layout.prior_precision[camera])
     modes = shapes[0] * free[:, None]

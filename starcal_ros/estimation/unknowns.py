@@ -204,6 +204,21 @@ class Layout:
         places = [np.arange(self.count)[self.places[name]] for name in names if name in self]
         return np.concatenate([np.empty(0, np.int64), *places])
 
+    @property
+    def field(self) -> Unknown:
+        """Entry of the field over the detector."""
+        return self['field']
+
+    @property
+    def shape(self) -> Unknown:
+        """Entry of the changes of the camera from image to image."""
+        return self['shape']
+
+    @property
+    def shape_at(self) -> slice:
+        """Place of the shape among the unknowns of an image."""
+        return self.places['shape']
+
     @functools.cached_property
     def field_at(self) -> Indices:
         """Places of the coefficients of the field; none in a list without it."""
@@ -407,6 +422,14 @@ def unknowns_of(given: EntryInputs) -> Layout:
     made = (kind.make(given) for kind in UNKNOWNS.values() if kind.make is not None)
     entries = *unknowns_in_state(given.problem, given.state).entries, *made
     return Layout(tuple(entry for entry in entries if entry is not None and len(entry)))
+
+
+def readout_rms_s(layout: Layout, mean: Floats, covariance: Floats, assumed: Assumptions) -> float:
+    """Return the rms time of read-out: by a posterior, where the errors of rates show it."""
+    if not {'rates', 'readout'} <= set(layout.places):
+        return math.hypot(*assumed.readout_s)
+    at = layout.places['readout'].start
+    return math.hypot(mean[at], covariance[at, at] ** 0.5)
 
 
 def _shape(given: EntryInputs) -> Unknown:
