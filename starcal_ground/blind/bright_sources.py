@@ -67,7 +67,7 @@ def bright_sources(pixels: Pixels) -> BrightSources:
     for radius_px in (4.0, 5.0):
         u2, v2 = (np.asarray((reach - offset[:, k, None]) ** 2, np.float32) for k in (0, 1))
         weight = light * (u2[:, None] + v2[:, :, None] <= radius_px**2)
-        offset = detection.centres(weight)
+        _, offset, _ = detection.second_moments(weight)
     total = light.sum(axis=(1, 2), dtype=np.float64)
     order = np.argsort(-total, kind='stable')
     order = order[total[order] > 0]

@@ -7,7 +7,6 @@ Positions of sources are good to a fifth of a pixel; `centroiding` measures the 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 import functools
 import math
@@ -436,27 +435,15 @@ def windows_inside(shape: tuple[int, ...], centre: Indices, radius: int) -> Mask
     return (u >= radius) & (u < width - radius) & (v >= radius) & (v < height - radius)
 
 
-def centres(light: Floats | Singles) -> Floats:
-    """Centres (n, 2) of stamps (n, side, side) from their middles."""
-    sums = _weighted_sums(light, ((0, 0), (1, 0), (0, 1)))
-    return np.asarray(sums[:, 1:] / np.maximum(sums[:, :1], 1e-9), np.float64)
-
-
 def second_moments(light: Floats | Singles) -> tuple[Floats, Floats, Floats]:
     """Sums (n,), centres (n, 2) from the middles, second moments (n, 3) uu, vv, uv of stamps."""
-    powers = ((0, 0), (1, 0), (0, 1), (2, 0), (0, 2), (1, 1))
-    sums = _weighted_sums(light.astype(np.float64), powers)
+    n, side, _ = light.shape
+    v, u = np.indices((side, side), np.float64).reshape(2, -1) - side // 2
+    powers = np.stack([np.ones_like(u), u, v, u * u, v * v, u * v], axis=-1)
+    sums = light.reshape(n, side * side).astype(np.float64) @ powers
     mean = sums[:, 1:] / np.maximum(sums[:, :1], 1e-9)
     place_px = mean[:, :2]
     return sums[:, 0], place_px, mean[:, 2:] - place_px[:, [0, 1, 0]] * place_px[:, [0, 1, 1]]
-
-
-def _weighted_sums(light: Floats | Singles, powers: Sequence[tuple[int, int]]) -> NDArray[Any]:
-    """Sums (n, k) over stamps (n, side, side) times u^i v^j, from their middles, of k powers."""
-    n, side, _ = light.shape
-    v, u = np.indices((side, side)).reshape(2, -1) - side // 2
-    weights: NDArray[Any] = np.stack([u**i * v**j for i, j in powers], axis=-1)
-    return np.asarray(light.reshape(n, side * side) @ weights.astype(light.dtype))
 
 
 def apart(xy_px: Floats, least_px: float) -> Mask:
