@@ -24,7 +24,7 @@ from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
 from starcal_ground.written_files import write_marked
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('forked_readers')]
 
 
 def _prior_in_out(here: Path) -> None:
