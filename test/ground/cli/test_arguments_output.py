@@ -78,10 +78,6 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda here: (here / 'bag/truth.json').unlink(),
         'simulate --scenario tiny -o HERE/bag',
     ),
-    'simulation over a file': (
-        lambda here: (here / 'a.mcap').write_text('recorded'),
-        'simulate --scenario tiny -o HERE/a.mcap',
-    ),
     'pointings over the bag': (
         lambda here: shutil.rmtree(here / 'out'),
         f'plan HERE/bag {_OWN} HERE/bag/tiny_0.mcap',
@@ -93,10 +89,6 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
     'catalog over its table': (
         lambda here: write_marked(here / 'gaia.npz', 'a table'),
         'catalog HERE/gaia.npz -o HERE/gaia.npz',
-    ),
-    'simulation over parameters': (
-        lambda here: (here / 'a_params.yaml').write_text('mine'),
-        'simulate --scenario tiny -o HERE/a.mcap',
     ),
     'simulation in a folder with another bag': (
         lambda here: (here / 'bag').rename(here / 'night'),
