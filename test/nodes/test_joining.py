@@ -23,14 +23,6 @@ from starcal_ros.ros.joining import joined, Kept
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calibrators]:
-    made = Calibrators(tmp_path, monkeypatch)
-    with made.is_full:
-        yield made
-    made.close_all()
-
-
 # What P1 holds after steps: images | calibrations, from the active one back in time.
 JOINS = scripts("""
 # A disk fails, and another one takes its place.
