@@ -8,7 +8,7 @@ without it, ``../shared/ros2tools/install.sh`` beside this repository makes one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import metadata
 import os
 from pathlib import Path
@@ -39,8 +39,8 @@ sys.meta_path.insert(0, Hidden())
 RUN_S = 240.0  # a command of ros2 takes 2 s; busy cores make that much of it
 
 
-def find_tools(folder: Path) -> Path:
-    """Return the folder of the tools, made in a folder if need be; skip the test without them."""
+def find_tools(made_once: Callable[..., Path]) -> Path:
+    """Return the folder of the tools, made once if need be; skip the test without them."""
     given = os.environ.get('STARCAL_ROS2_TOOLS', '')
     if given:
         return Path(given)
@@ -48,11 +48,14 @@ def find_tools(folder: Path) -> Path:
         pytest.skip('no real ROS 2 tools: STARCAL_ROS2_TOOLS is not set')
     if not metadata.version('rclpy').startswith(JAZZY_RCLPY):
         pytest.skip('the real ROS 2 tools beside this repository are built for Jazzy')
-    command = [str(BESIDE), sys.prefix, str(folder)]
-    made = subprocess.run(command, capture_output=True, text=True, check=False)
-    if made.returncode:
-        pytest.skip(f'the real ROS 2 tools are not for this Python: {made.stderr[-200:]}')
-    return folder
+
+    def install(folder: Path) -> None:
+        command = [str(BESIDE), sys.prefix, str(folder)]
+        made = subprocess.run(command, capture_output=True, text=True, check=False)
+        if made.returncode:
+            pytest.skip(f'the real ROS 2 tools are not for this Python: {made.stderr[-200:]}')
+
+    return made_once('ros2tools', install)
 
 
 class RosTools:

@@ -44,9 +44,17 @@ Make = Callable[..., RosTools]
 
 
 @pytest.fixture(scope='module')
-def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found: Path = find_tools(tmp_path_factory.mktemp('ros2tools'))
+def tools(made_once: Callable[..., Path]) -> Path:
+    found: Path = find_tools(made_once)
     return found
+
+
+@pytest.fixture(scope='module')
+def rosbag2(tools: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Skip a test where the libraries of rosbag2 do not load; its commands are missing then."""
+    ros2 = RosTools(tools, FAST, tmp_path_factory.mktemp('rosbag2'), {})
+    if ' record ' not in ros2.run('bag', '--help').stdout:
+        pytest.skip('rosbag2 does not load here')
 
 
 @pytest.fixture
@@ -71,15 +79,8 @@ def ros2(make: Make, request: pytest.FixtureRequest) -> RosTools:
     return make(request.param)
 
 
-def has_rosbag2(ros2: RosTools) -> bool:
-    """Return True if the libraries of rosbag2 load; its commands are missing otherwise."""
-    return ' record ' in ros2.run('bag', '--help').stdout
-
-
-def test_launch_replay_calibrate_and_record(ros2, tiny_bag, tmp_path) -> None:
+def test_launch_replay_calibrate_and_record(rosbag2, ros2, tiny_bag, tmp_path) -> None:
     """The sequence of the README with every launch argument, ended as a terminal ends it."""
-    if not has_rosbag2(ros2):
-        pytest.skip('ros2 bag record does not load here')
     recorded = tmp_path / 'recorded'
     launch = ros2.start(
         *('launch', 'starcal', 'starcal.launch.py', f'params_file:={tiny_bag}/params.yaml'),
@@ -126,7 +127,7 @@ def test_replay_launch(make, client, tiny_bag, tmp_path) -> None:
     client.until_images(10)
     launch.interrupt_group()
     assert 'process has died' not in launch.said(), launch.said()
-    if not has_rosbag2(ros2):
+    if ' record ' not in ros2.run('bag', '--help').stdout:  # the libraries do not load
         return
     info = ros2.run('bag', 'info', tmp_path / 'state' / 'ensemble' / '00000001.mcap')
     words = info.stdout.split()
@@ -329,10 +330,10 @@ def as_no_database(folder: Path) -> None:
     ],
     ids=['mcap', 'sqlite', 'damaged', 'cut off', 'no database'],
 )
-def test_without_the_wheels_rosbag2_reads_bags(write, line, make, tiny_products, tmp_path) -> None:
+def test_without_the_wheels_rosbag2_reads_bags(
+    write, line, make, rosbag2, tiny_products, tmp_path
+) -> None:
     ros2 = make(FAST)
-    if not has_rosbag2(ros2):
-        pytest.skip('rosbag2 does not load here')
     write(tmp_path / 'bag')
     (tmp_path / 'sitecustomize.py').write_text(HIDDEN)
     path = f'{tmp_path}:{ROOT}:{ros2.environment["PYTHONPATH"]}'
