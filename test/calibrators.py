@@ -68,12 +68,15 @@ class Calibrators:
             getattr(self, words[0])(process, *words[1:])
         return self.states.setdefault('P1', CalibratorState(self._clock))
 
-    def open(self, process: str, place: str, **changes: str) -> None:
-        """Clean up and configure: with a folder, or ``-`` for memory alone."""
+    def open(self, process: str, place: str, key: str = '') -> None:
+        """Clean up and configure: with a folder, or ``-`` for memory alone, and a key file."""
         state = self.states.setdefault(process, CalibratorState(self._clock))
         state.close()
         folder = '' if place == '-' else str(self.disk / place)
-        state.open(self.setup, CalibratorOptions(state_dir=folder, **changes))
+        if key:
+            key = str(self.disk / key)
+            Path(key).write_bytes(b'sixteen bytes...')
+        state.open(self.setup, CalibratorOptions(state_dir=folder, state_key_file=key))
 
     def close(self, process: str) -> None:
         self.states[process].close()
@@ -122,6 +125,11 @@ class Calibrators:
         """Limit the change from the active calibration; that from the prior to five times it."""
         gate = dataclasses.replace(self.setup.gate, max_change_px=float(max_change_px))
         self.setup = dataclasses.replace(self.setup, gate=gate)
+
+    def camera(self, _process: str, frame: str) -> None:
+        """Configure the camera of a frame from now on, with the same sensor."""
+        frames = dataclasses.replace(self.setup.frames, camera_frame=frame)
+        self.setup = dataclasses.replace(self.setup, frames=frames)
 
     def turn(self, _process: str, degrees: str) -> None:
         """Turn the mounting of the prior about the boresight."""

@@ -23,6 +23,7 @@ from starcal_ground.bags.reader import read_images, Topics
 from starcal_ground.comparison import alignment_difference_rad, compare, truth_like
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
+from starcal_ground.written_files import write_marked
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_calibration
@@ -84,9 +85,12 @@ def test_camera_info_is_the_calibration_without_skew(tiny_products) -> None:
 
 
 def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path, starcal) -> None:
-    bag = tiny_products / 'observations.mcap'
-    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
-    assert done.status == 0, done.err
+    """No report is written, and an earlier one is removed, where none is wanted."""
+    write_marked(tmp_path / 'report.html', 'of earlier products')
+    given = ['--params', TINY / 'params.yaml', '-o', tmp_path, '--no-report']
+    done = starcal('calibrate', tiny_products / 'observations.mcap', *given)
+    assert done.status == 0 and f'\nproducts written to {tmp_path}\n' in done.out, done.err
+    assert not (tmp_path / 'report.html').exists()
     first, second = (
         json.loads((folder / 'calibration.json').read_text())
         for folder in (tiny_products, tmp_path)
