@@ -6,7 +6,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from mission_files import params_with, TINY  # type: ignore[import-not-found]
+from mission_files import params_with  # type: ignore[import-not-found]
 import pytest
 
 REAL_SKY = Path(__file__).parents[5] / 'shared' / 'realsky'
@@ -20,7 +20,7 @@ REAL_SKY = Path(__file__).parents[5] / 'shared' / 'realsky'
         # More images than there are, or than most cameras take: a sound set that is refused.
         lambda few, folder: [few, '--params', params_with(folder, min_images=4)],
         lambda few, folder: [few, '--params', params_with(folder, min_coverage=1.0)],
-        lambda *_: [TINY, '--set', 'min_images=11'],
+        lambda few, _: [few, '--set', 'min_images=4'],
         lambda *_: [REAL_SKY / 'polaris'],
     ],
 )
