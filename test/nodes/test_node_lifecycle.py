@@ -49,7 +49,8 @@ def try_everything(manager: Manager, state: str) -> None:
     for number in (*NUMBERS, NO_TRANSITION):
         if number not in own:
             assert not manager.change(number), number
-            assert manager.state() == state, number
+    # Where one of them had led elsewhere, the node would have made another from there.
+    assert manager.state() == state
     for number, reached, back in ALLOWED[state]:
         assert manager.change(number)
         assert manager.state() == reached
