@@ -8,7 +8,7 @@ without it, ``../shared/ros2tools/install.sh`` beside this repository makes one 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import metadata
 import os
 from pathlib import Path
@@ -18,6 +18,7 @@ import sys
 import time
 
 import pytest
+from vehicle import LoggedProcess, with_log  # type: ignore[import-not-found]
 
 BESIDE = Path(__file__).parents[2] / 'shared' / 'ros2tools' / 'install.sh'
 PROFILE = Path(__file__).parents[1] / 'config' / 'cyclonedds.xml'
@@ -38,8 +39,8 @@ sys.meta_path.insert(0, Hidden())
 RUN_S = 240.0  # a command of ros2 takes 2 s; busy cores make that much of it
 
 
-def find_tools(folder: Path) -> Path:
-    """Return the folder of the tools, made in a folder if need be; skip the test without them."""
+def find_tools(made_once: Callable[..., Path]) -> Path:
+    """Return the folder of the tools, made once if need be; skip the test without them."""
     given = os.environ.get('STARCAL_ROS2_TOOLS', '')
     if given:
         return Path(given)
@@ -47,11 +48,14 @@ def find_tools(folder: Path) -> Path:
         pytest.skip('no real ROS 2 tools: STARCAL_ROS2_TOOLS is not set')
     if not metadata.version('rclpy').startswith(JAZZY_RCLPY):
         pytest.skip('the real ROS 2 tools beside this repository are built for Jazzy')
-    command = [str(BESIDE), sys.prefix, str(folder)]
-    made = subprocess.run(command, capture_output=True, text=True, check=False)
-    if made.returncode:
-        pytest.skip(f'the real ROS 2 tools are not for this Python: {made.stderr[-200:]}')
-    return folder
+
+    def install(folder: Path) -> None:
+        command = [str(BESIDE), sys.prefix, str(folder)]
+        made = subprocess.run(command, capture_output=True, text=True, check=False)
+        if made.returncode:
+            pytest.skip(f'the real ROS 2 tools are not for this Python: {made.stderr[-200:]}')
+
+    return made_once('ros2tools', install)
 
 
 class RosTools:
@@ -72,7 +76,7 @@ class RosTools:
             self.environment['CYCLONEDDS_URI'] = PROFILE.as_uri()
         self._ros2 = str(tools / 'bin' / 'ros2')
         self._logs = logs
-        self._started: list[subprocess.Popen[bytes]] = []
+        self._started: list[LoggedProcess] = []
 
     def run(
         self, *arguments: str | Path, timeout_s: float = RUN_S
@@ -104,64 +108,29 @@ class RosTools:
             assert time.monotonic() < deadline_s, (arguments, done.stdout, done.stderr)
         return done.stdout
 
-    def start(self, *arguments: str | Path) -> Started:
+    def start(self, *arguments: str | Path) -> LoggedProcess:
         """Start `ros2` with these arguments."""
         return self._start([self._ros2, *map(str, arguments)])
 
-    def start_node(self, name: str, *ros: str | Path) -> Started:
+    def start_node(self, name: str, *ros: str | Path) -> LoggedProcess:
         """Start a node of starcal with ROS arguments."""
         package = 'starcal_ground' if name in ('bag_player', 'setup_finder') else 'starcal_ros'
         module = f'{package}.ros.{name}'
         return self._start([sys.executable, '-m', module, '--ros-args', *map(str, ros)])
 
-    def _start(self, command: list[str]) -> Started:
+    def _start(self, command: list[str]) -> LoggedProcess:
+        """Start a process that leads a group with its children."""
         log = self._logs / f'{len(self._started)}.log'
-        with log.open('wb') as output:
-            process = subprocess.Popen(
-                command,
-                env=self.environment,
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
-        self._started.append(process)
-        return Started(process, log)
+        process = with_log(command, log, env=self.environment, start_new_session=True)
+        self._started.append(LoggedProcess(' '.join(command), log, process))
+        return self._started[-1]
 
     def close(self, failed: bool) -> None:
         """Kill what has not ended by itself; after a failed test, print what all wrote."""
-        for k, process in enumerate(self._started):
-            if process.poll() is None:
+        for one in self._started:
+            if one.process.poll() is None:
                 # Python's fault handler answers SIGABRT with the stacks of all threads.
-                os.killpg(process.pid, signal.SIGABRT if failed else signal.SIGKILL)
-            process.wait()
+                os.killpg(one.process.pid, signal.SIGABRT if failed else signal.SIGKILL)
+            status = one.process.wait()
             if failed:
-                said = (self._logs / f'{k}.log').read_text(errors='replace')
-                print(f'{process.args!s}, exit status {process.returncode}:\n{said}')
-
-
-class Started:
-    """A process, with its children in a process group, and what it wrote."""
-
-    def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
-        self.process, self._log = process, log
-
-    def said(self) -> str:
-        """All that it has written so far."""
-        return self._log.read_text(errors='replace')
-
-    def until_said(self, text: str) -> None:
-        """Wait for a text in what it writes."""
-        deadline_s = time.monotonic() + RUN_S
-        while text not in self.said():
-            assert self.process.poll() is None and time.monotonic() < deadline_s, self.said()
-            time.sleep(0.05)
-
-    def interrupt(self) -> int:
-        """Exit status after SIGINT to the whole process group, as a terminal sends it."""
-        os.killpg(self.process.pid, signal.SIGINT)
-        return self.process.wait(RUN_S)
-
-    def wait(self) -> int:
-        """Exit status when it ends by itself."""
-        return self.process.wait(RUN_S)
+                print(f'{one.name}, exit status {status}:\n{one.said()}')

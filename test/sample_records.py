@@ -184,9 +184,9 @@ def model_checks() -> ModelChecks:
     )
 
 
-def without_field() -> Calibration:
-    """The calibration of a camera that has a lens model alone."""
-    found = calibration()
+def without_field(found: Calibration | None = None) -> Calibration:
+    """A calibration, by default that of this module, of a camera that has a lens model alone."""
+    found = found or calibration()
     camera = dataclasses.replace(found.geometry.camera, field=None)
     geometry = dataclasses.replace(found.geometry, camera=camera)
     return dataclasses.replace(found, geometry=geometry, field=None)

@@ -34,29 +34,24 @@ def parameters(folder: Path, *values: str) -> tuple[str, ...]:
     return ('--params-file', str(folder / 'params.yaml'), *more)
 
 
-class NodeProcess:
-    """A node as a separate process with its output in a file."""
+class LoggedProcess:
+    """A process with its output in a file."""
 
-    def __init__(self, name: str, log: Path, arguments: list[str], forked: bool) -> None:
-        self.name = name
-        self._log = log
-        self.process: ForkedProcess | subprocess.Popen[bytes]
-        log.touch()
-        if forked:
-            self.process = ForkedNode(name, arguments, log)
-            return
-        with log.open('wb') as output:
-            self.process = subprocess.Popen(
-                [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments],
-                stdin=subprocess.DEVNULL,
-                stdout=output,
-                stderr=subprocess.STDOUT,
-                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
-            )
+    def __init__(
+        self, name: str, log: Path, process: ForkedProcess | subprocess.Popen[bytes]
+    ) -> None:
+        self.name, self._log, self.process = name, log, process
 
     def said(self) -> str:
         """Return the output so far."""
         return self._log.read_text(errors='replace')
+
+    def until_said(self, text: str) -> None:
+        """Wait for a text in the output of a process that runs."""
+        deadline_s = time.monotonic() + START_S
+        while text not in self.said():
+            assert self.process.poll() is None and time.monotonic() < deadline_s, self.said()
+            time.sleep(0.05)
 
     def wait(self, timeout_s: float = START_S) -> int:
         """Wait for the end of the process; return its exit status.  One that hangs is killed."""
@@ -67,6 +62,11 @@ class NodeProcess:
             self.process.send_signal(signal.SIGABRT)
             self.process.wait()
             pytest.fail(f'{self.name} did not end in {timeout_s:.0f} s:\n{self.said()}')
+
+    def interrupt_group(self) -> int:
+        """Exit status after SIGINT to the process group that it leads, as a terminal sends it."""
+        os.killpg(self.process.pid, signal.SIGINT)
+        return self.wait()
 
     def stop(self, number: int = signal.SIGINT) -> int:
         """Send a signal and return the exit status, as `wait` does."""
@@ -85,6 +85,32 @@ class NodeProcess:
         except subprocess.TimeoutExpired:
             self.process.kill()
             self.process.wait()
+
+
+def with_log(command: Sequence[str], log: Path, **options: Any) -> subprocess.Popen[bytes]:
+    """Start a process that writes all its output to a file."""
+    with log.open('wb') as output:
+        return subprocess.Popen(
+            command,
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=subprocess.STDOUT,
+            **options,
+        )
+
+
+class NodeProcess(LoggedProcess):
+    """A node as a separate process."""
+
+    def __init__(self, name: str, log: Path, arguments: list[str], forked: bool) -> None:
+        log.touch()
+        process: ForkedProcess | subprocess.Popen[bytes]
+        if forked:
+            process = ForkedNode(name, arguments, log)
+        else:
+            command = [sys.executable, '-m', 'starcal_ros.entry_points', name, *arguments]
+            process = with_log(command, log, env={**os.environ, 'PYTHONFAULTHANDLER': '1'})
+        super().__init__(name, log, process)
 
 
 StartNode = Callable[..., NodeProcess]
@@ -238,13 +264,6 @@ class Client:
         found = self.statuses()
         self.until(lambda: found and getattr(found[-1], key) == images)
         return found[-1]
-
-    def until_refused(self, *expected: tuple[str, int]) -> None:
-        """Wait until a calibrator reports these reasons of refused images and their counts."""
-        found = self.statuses()
-        self.until(
-            lambda: found and [(e.reason, e.count) for e in found[-1].refused] == [*expected]
-        )
 
     def fill(self, images: Sequence[Any]) -> None:
         """Publish observations to a calibrator; wait until it has all of them."""

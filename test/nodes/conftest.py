@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Files of tests with nodes are skipped where rclpy or the messages of starcal are missing."""
+"""Calibrators without nodes; files with nodes are skipped where rclpy or messages are missing."""
 
 from __future__ import annotations
 
@@ -7,9 +7,19 @@ from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
+from calibrators import Calibrators  # type: ignore[import-not-found]
 import pytest
 
 MISSING = [name for name in ('rclpy', 'starcal') if find_spec(name) is None]
+
+
+@pytest.fixture
+def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calibrators]:
+    """Calibrators that share a disk; their folders are released at the end."""
+    made = Calibrators(tmp_path, monkeypatch)
+    with made.is_full:
+        yield made
+    made.close_all()
 
 
 class WithoutRos(pytest.Module):

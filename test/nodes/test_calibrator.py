@@ -186,8 +186,8 @@ def test_driver_is_told_and_its_failures_are_seen(vehicle: Vehicle) -> None:
     with closing(Client()) as silent:
         silent.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
         until_told(vehicle, 'no answer within 5 s', b'\x01')
-        # The first failure was that the service was not there; then it is called again.
-        vehicle.until(lambda: int(vehicle.health('calibrator')[2]['camera_driver_failures']) >= 3)
+        # The first failure was that the service was not there.
+        assert int(vehicle.health('calibrator')[2]['camera_driver_failures']) >= 2
 
     received: list[Any] = []
     accepts = False

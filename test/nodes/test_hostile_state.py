@@ -25,6 +25,7 @@ from attacks import (  # type: ignore[import-not-found]
 )
 from hypothesis import given
 import pytest
+from sample_records import without_field  # type: ignore[import-not-found]
 
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.errors import StarcalError
@@ -42,8 +43,11 @@ Change = list[tuple[int, object]]
 
 def write_state(folder: Path, seal: Seal) -> Path:
     """A state folder with two images and two activations of one calibration."""
-    first = dataclasses.replace(calibration(), number=1, active_since_ns=10**9)
-    history = (Activation(1, 0, first), Activation(2, 1, dataclasses.replace(first, number=2)))
+    first, second = (
+        dataclasses.replace(one, number=number, active_since_ns=10**9)
+        for number, one in ((1, without_field(calibration())), (2, calibration()))
+    )
+    history = (Activation(1, 0, first), Activation(2, 1, second))
     with contextlib.closing(Archive(folder, 'camera', seal)) as archive:
         ensemble = Ensemble(observations()[:2], {'no_stars': 1})
         archive.keep(ensemble, history, Collections().begun())

@@ -23,14 +23,6 @@ from starcal_ros.ros.joining import joined, Kept
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calibrators]:
-    made = Calibrators(tmp_path, monkeypatch)
-    with made.is_full:
-        yield made
-    made.close_all()
-
-
 # What P1 holds after steps: images | calibrations, from the active one back in time.
 JOINS = scripts("""
 # A disk fails, and another one takes its place.
@@ -133,84 +125,43 @@ def test_the_limit_of_images_holds(calibrators: Calibrators) -> None:
     assert len(list((calibrators.disk / 'A' / 'ensemble').glob('*.mcap'))) == 4
 
 
-def of_frame(calibrators: Calibrators, frame: str) -> None:
-    """Configure another camera with the same sensor from now on."""
-    frames = dataclasses.replace(calibrators.setup.frames, camera_frame=frame)
-    calibrators.setup = dataclasses.replace(calibrators.setup, frames=frames)
-
-
-# Steps, what is changed then, where P1 opens, what it says, and what P1 and A hold as before.
-UNJOINED: dict[str, tuple[str, str, str, str]] = {
-    'in memory of another camera': (
-        'open -; images 0 1; activate m',
-        'navcam_2',
-        'A',
-        r'2 images and 1 activation are of a camera of .* in camera, and not on disk: configure',
-    ),
-    'not saved of another camera': (
-        'open A; images 0; full; images 1; activate m; close; room',
-        'navcam_2',
-        '-',
-        'and not on disk: configure with that camera and a state_dir that can be written',
-    ),
-    'a folder of another camera': (
-        'P2 open A; P2 images 2; P2 close; open -; images 0 1; activate m',
-        'navcam_1',
-        'A',
-        r'A is of the camera navcam_1, 2 images and 1 activation in memory are of .*: choose',
-    ),
-    'in use': (
-        'P2 open A; open -; images 0 1; activate m',
-        '',
-        'A',
-        'in use by another calibrator',
-    ),
-    'another key': (
-        'P2 open A; P2 images 2; P2 activate a; P2 close; open -; images 0 1; activate m',
-        'key',
-        'A',
-        'no file of .*A has an HMAC of state_key_file, but 2 are sound: give the key',
-    ),
-}
+# How the last step fails; before it, P1 holds images 0 and 1 and calibration m.
+UNJOINED = scripts(r"""
+of another camera -> 2 images and 1 activation are of .* in camera, and not on disk: configure
+    open -; images 0 1; activate m; camera navcam_2; open A
+not saved of another -> and not on disk: configure with that camera and a state_dir that can be
+    open A; images 0; full; images 1; activate m; close; room; camera navcam_2; open -
+a folder of another -> A is of the camera navcam_1, 2 images and 1 activation in memory are of .*:
+    camera navcam_1; P2 open A; P2 images 2; P2 close; camera camera;
+    open -; images 0 1; activate m; open A
+in use -> in use by another calibrator
+    P2 open A; open -; images 0 1; activate m; open A
+another key -> no file of .*A has an HMAC of state_key_file, but 2 are sound: give the key
+    P2 open A; P2 images 2; P2 activate a; P2 close; open -; images 0 1; activate m; open A key
+""")
 
 
 @pytest.mark.parametrize('name', UNJOINED)
 def test_what_cannot_be_joined_stops_the_transition(name: str, calibrators: Calibrators) -> None:
     """One sentence with the remedy; memory and folder are as before."""
-    steps, change, place, words = UNJOINED[name]
-    first = calibrators.setup
-    if change == 'navcam_1':  # it has written the folder
-        of_frame(calibrators, change)
-        calibrators.run(steps.split('; open')[0])
-        calibrators.setup, steps = first, f'open{steps.split("; open")[1]}'
-    state = calibrators.run(steps)
+    steps, words = UNJOINED[name]
+    before, _, last = steps.rpartition('; ')
+    state = calibrators.run(before)
     files = sorted(path.name for path in calibrators.disk.glob('A/*/*'))
-    options: dict[str, Any] = {}
-    if change == 'key':
-        options['state_key_file'] = str(calibrators.disk / 'key')
-        (calibrators.disk / 'key').write_bytes(b'sixteen bytes...')
-    elif change == 'navcam_2':
-        of_frame(calibrators, change)
     with pytest.raises(StarcalError, match=words) as error:
-        calibrators.open('P1', place, **options)
+        calibrators.run(last)
     assert len(str(error.value).replace(str(calibrators.disk), '')) < 300
     assert sorted(path.name for path in calibrators.disk.glob('A/*/*')) == files
-    calibrators.setup = first
-    calibrators.open('P1', 'B')
+    calibrators.run('camera camera; open B')
     assert kept(state) == ('0 1', 'm')
 
 
 def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators: Calibrators) -> None:
     """Its records stay in its folder, and are not mixed with those of the other."""
-    first = calibrators.setup
-    state = calibrators.run('open A; images 0 1; activate a')
-    of_frame(calibrators, 'navcam_2')
-    calibrators.open('P1', 'B')
+    state = calibrators.run('open A; images 0 1; activate a; camera navcam_2; open B')
     assert str(state).endswith(f'they stay in {calibrators.disk / "A"}')
     assert kept(state) == ('', '')
-    calibrators.run('images 2; close')
-    calibrators.setup = first
-    calibrators.open('P1', 'A')
+    calibrators.run('images 2; close; camera camera; open A')
     assert kept(state) == ('0 1', 'a')
 
 

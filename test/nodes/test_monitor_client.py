@@ -3,9 +3,6 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
-import sys
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -25,8 +22,6 @@ from starcal_ros.ros.node import make_message
 
 pytestmark = pytest.mark.nodes
 
-CLIENT = (sys.executable, '-m', 'starcal_ros.entry_points')
-REMAP = ('--ros-args', '-r')
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -45,12 +40,8 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         publish(StarObservations, 'observations', sound)
         client.until(lambda: monitor.received.images == 1)
         assert monitor.received.last is not None and len(monitor.received.last) == len(record)
-        publish(
-            EnsembleStatus,
-            'ensemble_status',
-            status_to_message(counted, 'camera', make_message),
-            LATCHED,
-        )
+        collected = status_to_message(counted, 'camera', make_message)
+        publish(EnsembleStatus, 'ensemble_status', collected, LATCHED)
         client.until(lambda: monitor.received.status is not None)
         ensemble = monitor.received.status
         assert ensemble is not None and ensemble.images == counted.images
@@ -60,11 +51,11 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         publish(Calibration, 'calibration', message, LATCHED)
         client.until(lambda: monitor.received.active is not None)
         assert monitor.received.candidate is None
-        healthy = DiagnosticStatus(
+        late = DiagnosticStatus(
             level=DiagnosticStatus.WARN, name='starcal: star_observer', message='late'
         )
         other = DiagnosticStatus(name='another node', message='no concern of ours')
-        publish(DiagnosticArray, '/diagnostics', DiagnosticArray(status=[healthy, other]))
+        publish(DiagnosticArray, '/diagnostics', DiagnosticArray(status=[late, other]))
         client.until(lambda: monitor.received.health)
         assert monitor.received.health == {'star_observer': (1, 'late')}
         sound.covariance_px2[0] = -1.0
@@ -77,18 +68,13 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         monitor.destroy_node()
 
 
-def test_a_signal_while_it_draws_ends_it_without_a_traceback(client: Client) -> None:
+def test_a_signal_while_it_draws_ends_it_without_a_traceback(
+    client: Client, start_node: StartNode
+) -> None:
     """Signals at other times: test_node_lifecycle.py, for all that end by `until_told_to_end`."""
-    command = [*CLIENT, 'starcal_ground.ros.monitor_client', *REMAP, '__node:=ended']
-    end = subprocess.PIPE
-    with subprocess.Popen(command, stdout=end, stderr=end, text=True) as monitor:
-        try:
-            client.until(lambda: 'ended' in client.node.get_node_names())
-            monitor.send_signal(signal.SIGINT)
-            said = monitor.communicate()[1]
-        finally:
-            monitor.kill()
-    assert monitor.returncode == 0 and 'Traceback' not in said, said
+    monitor = start_node('starcal_ground.ros.monitor_client', '-r', '__node:=ended', forked=False)
+    client.until(lambda: 'ended' in client.node.get_node_names())
+    assert monitor.stop() == 0 and 'Traceback' not in monitor.said(), monitor.said()
 
 
 @pytest.mark.parametrize(

@@ -49,7 +49,8 @@ def try_everything(manager: Manager, state: str) -> None:
     for number in (*NUMBERS, NO_TRANSITION):
         if number not in own:
             assert not manager.change(number), number
-            assert manager.state() == state, number
+    # Where one of them had led elsewhere, the node would have made another from there.
+    assert manager.state() == state
     for number, reached, back in ALLOWED[state]:
         assert manager.change(number)
         assert manager.state() == reached
@@ -61,11 +62,8 @@ def try_everything(manager: Manager, state: str) -> None:
 @pytest.mark.parametrize('state', PATHS)
 def test_every_transition_in_every_state(vehicle: Vehicle, state: str, shut_down: bool) -> None:
     """Each node survives all transitions, and a signal ends it with status 0 in every state."""
-    # What is shut down ends as finalized, whatever it was: one interpreter of its own shows that.
-    nodes = [
-        vehicle.start(name, 'autostart:=false', forked=shut_down and state != 'active')
-        for name in BOTH
-    ]
+    # An interpreter of its own ends with all threads and publishers where the node was active.
+    nodes = [vehicle.start(name, 'autostart:=false', forked=state != 'active') for name in BOTH]
     # Each state meets both signals; the two nodes end by the same code.
     signals = [signal.SIGINT, signal.SIGTERM]
     for node, number in zip(nodes, signals[::-1] if shut_down else signals, strict=True):
@@ -192,6 +190,24 @@ def test_a_node_ends_by_signals_and_errors(name: str) -> None:
     assert run(OF_A_NODE + code, argument) == expected
 
 
+INTERRUPTED = """
+import signal, sys
+signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
+class Interrupt:
+    def find_spec(self, name, *_):
+        if name == 'starcal_ros.pipeline.setup':
+            signal.raise_signal(signal.SIGINT)
+sys.meta_path.insert(0, Interrupt())
+from starcal_ros import entry_points
+entry_points.calibrator()
+"""
+
+
+def test_a_signal_while_python_imports_ends_it_without_a_traceback() -> None:
+    """Ctrl-C at the console script."""
+    assert run(INTERRUPTED) == (-signal.SIGINT, '', '')
+
+
 EXECUTOR_OF_A_NODE = """
 import os, signal, sys
 import rclpy
@@ -313,7 +329,7 @@ def test_threads_share_one_arena_of_memory() -> None:
     assert (status, error) == (0, '') and out.count('<heap nr=') == 1
 
 
-@pytest.mark.parametrize('seed', range(4))
+@pytest.mark.parametrize('seed', range(2))
 def test_nodes_end_after_several_signals(vehicle: Vehicle, seed: int) -> None:
     """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
     rng = random.Random(seed)

@@ -101,9 +101,10 @@ def test_what_stays_on_the_ground_cannot_be_imported() -> None:
 
 
 def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
-    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    vehicle: Vehicle, few_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of the messages of a player on the ground, with a state folder."""
+    vehicle.bag = few_images
     for name in BOTH:
         vehicle.start(name, f'state_dir:={tmp_path}/kept', ros=REMAPS, forked=False)
     vehicle.until_listened()
@@ -112,14 +113,14 @@ def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
         on_ground.delenv('PYTHONPATH')
         player = vehicle.start_node('bag_player', *ros, forked=False)
     assert player.wait() == 0, player.said()
-    vehicle.until_images(10, 'images_saved')
+    vehicle.until_images(3, 'images_saved')
     vehicle.calibrate()
     published = vehicle.until_latched(Calibration, 'calibration')
     done = run('-c', READ, tmp_path / 'kept')
     assert (done.returncode, done.stderr) == (0, '')
     is_accepted, images, sight = json.loads(done.stdout)
     assert is_accepted and published[0].accepted
-    assert images == published[0].images_used == 10
+    assert images == published[0].images_used == 3
     expected = starcal_ros.lines_of_sight(
         calibration_from_message(published[0]), [0.0, 0.0], 'star_tracker'
     )

@@ -106,27 +106,27 @@ def attitude_messages(mounted: Rotation, from_ns: int, to_ns: int) -> list[Any]:
 def test_one_takes_over_from_another(vehicle: Vehicle, tmp_path: Path) -> None:
     """Every image is used, and the calibration has the alignment to each star tracker."""
     params = parameter_file(vehicle.bag, tmp_path / 'params.yaml')
-    bag, samples = tmp_path / 'two', attitudes()
+    bag, samples, shown = tmp_path / 'two', attitudes(), images()[4:]
     with BagWriter(bag) as writer:
         for k, (time_ns, xyzw) in enumerate(samples):
             if k < 0.7 * len(samples):
                 writer.write_attitude('/attitude', time_ns, xyzw, 'icrf')
             quaternion = (Rotation.from_quat(xyzw) * FIRST_FROM_OTHER).as_quat()
             writer.write_attitude('/other/attitude', time_ns, quaternion, 'icrf')
-        for image in images():
+        for image in shown:
             writer.write_image('/image', image, 'camera')
     for name in ('star_observer', 'calibrator'):
         vehicle.start_node(name, '--params-file', str(params))
     vehicle.until_listened()
     vehicle.play(bag)
-    vehicle.until_images(len(images()))
+    vehicle.until_images(len(shown))
     vehicle.calibrate()
     found = vehicle.until_latched(Calibration, 'calibration')
     first, other = calibration_from_message(found[0]).star_trackers
     assert (first.frame, other.frame) == ('star_tracker', 'other')
-    assert first.images + other.images == len(images())
+    assert first.images + other.images == len(shown)
     # Of an image that has both, the one whose next sample comes first: three have the other alone.
-    assert 0 < first.images <= 0.7 * len(images())
+    assert 0 < first.images <= len(shown) - 3
 
 
 def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 import contextlib
 import dataclasses
 import itertools
@@ -209,13 +208,6 @@ def test_one_image_of_another_size_is_set_aside(tmp_path: Path) -> None:
     assert len(state.ensemble.images) == 2
     assert '00000003.mcap.damaged' in state.damage[0] and 'an image of 1280 x' in state.damage[0]
     state.close()
-
-
-@pytest.fixture
-def calibrators(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Calibrators]:
-    made = Calibrators(tmp_path, monkeypatch)
-    yield made
-    made.close_all()
 
 
 # Which calibration is active after steps | words of the answer to the last request.  A candidate

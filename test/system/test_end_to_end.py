@@ -23,6 +23,7 @@ from starcal_ground.bags.reader import read_images, Topics
 from starcal_ground.comparison import alignment_difference_rad, compare, truth_like
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
+from starcal_ground.written_files import write_marked
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
 from starcal_ros.formats.products.product_files import read_calibration
@@ -40,12 +41,6 @@ needs_interfaces = pytest.mark.skipif(
     importlib.util.find_spec('rclpy') is None or importlib.util.find_spec('starcal') is None,
     reason='needs rclpy and the built interfaces',
 )
-
-
-def in_a_process(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """Run the tool as a user does, with its log in the standard error stream."""
-    command = [sys.executable, '-m', 'starcal_ground.cli.main', *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
 
 
 def read_truth(path: Path) -> CameraGeometry:
@@ -90,9 +85,12 @@ def test_camera_info_is_the_calibration_without_skew(tiny_products) -> None:
 
 
 def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path, starcal) -> None:
-    bag = tiny_products / 'observations.mcap'
-    done = starcal('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path)
-    assert done.status == 0, done.err
+    """No report is written, and an earlier one is removed, where none is wanted."""
+    write_marked(tmp_path / 'report.html', 'of earlier products')
+    given = ['--params', TINY / 'params.yaml', '-o', tmp_path, '--no-report']
+    done = starcal('calibrate', tiny_products / 'observations.mcap', *given)
+    assert done.status == 0 and f'\nproducts written to {tmp_path}\n' in done.out, done.err
+    assert not (tmp_path / 'report.html').exists()
     first, second = (
         json.loads((folder / 'calibration.json').read_text())
         for folder in (tiny_products, tmp_path)
@@ -101,10 +99,12 @@ def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path
     assert first == second
 
 
-def test_the_gate_refuses_with_status_3_and_writes_the_products(tmp_path, starcal) -> None:
+def test_the_gate_refuses_with_status_3_and_writes_the_products(
+    few_images, tmp_path, starcal
+) -> None:
     of_nodes = {'autostart': True, 'attitude_timeout_s': 2.0, 'use_sim_time': True}
     params = params_with(tmp_path, max_change_px=1e-6, **of_nodes)
-    done = starcal('calibrate', TINY, '--params', params, '-o', tmp_path / 'out')
+    done = starcal('calibrate', few_images, '--params', params, '-o', tmp_path / 'out')
     assert (done.status, done.err) == (3, '')
     assert 'max_change_px' in done.out
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
@@ -158,7 +158,7 @@ def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
 
 
 def test_a_zenith_campaign_gives_the_truth(tmp_path, starcal) -> None:
-    scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=12)
+    scenario = dataclasses.replace(synthetic.scenario('small', 2), image_count=6)
     made = simulated_bag.write_bag(scenario, tmp_path / 'bag.mcap')
     out = tmp_path / 'out'
     assert starcal('calibrate', made.bag, '--params', made.params, '-o', out).status == 0
@@ -167,10 +167,13 @@ def test_a_zenith_campaign_gives_the_truth(tmp_path, starcal) -> None:
 
 
 def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
+    """In a process of its own, whose log is in the standard error stream."""
     whole = (TINY / 'tiny_0.mcap').read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) * 7 // 10])
-    done = in_a_process('calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out')
+    tool = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate', bag, '--no-report']
+    given = ['--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
+    done = subprocess.run([*tool, *given], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     damage, refused = done.stderr.splitlines()
     assert 'truncated' in damage and '1 of 7 images refused, no_attitude' in refused
@@ -181,11 +184,11 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
 
 @needs_interfaces
 @pytest.mark.nodes
-def test_the_demonstration_on_the_real_graph(tmp_path) -> None:
-    done = in_a_process('demo', '-o', tmp_path)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert 'sigma' in done.stdout and 'alignment z' in done.stdout
-    assert done.stdout.endswith(f'open {tmp_path / "report.html"}\n')
+def test_the_demonstration_on_the_real_graph(tmp_path, starcal) -> None:
+    done = starcal('demo', '-o', tmp_path)
+    assert done.status == 0, done
+    assert 'sigma' in done.out and 'alignment z' in done.out
+    assert done.out.endswith(f'open {tmp_path / "report.html"}\n')
     assert (tmp_path / 'report.html').stat().st_size > 100_000  # with its pictures
     assert read_calibration(tmp_path / 'calibration.json').images_used == 10
 

@@ -48,9 +48,10 @@ def test_from_arrays(tmp_path) -> None:
 
 
 @pytest.mark.slow
-def test_from_bag(tmp_path) -> None:
+def test_from_bag(few_images, tmp_path) -> None:
     written = tmp_path / 'calibration.json'
-    done = run(tmp_path, EXAMPLES / 'from_bag.py', TINY, TINY / 'params.yaml', written)
+    params = few_images / 'params.yaml'
+    done = run(tmp_path, EXAMPLES / 'from_bag.py', few_images, params, written)
     assert (done.returncode, done.stderr) == (0, '')
     assert len(done.stdout.splitlines()) == 10
     assert read_calibration(written).accepted
@@ -82,10 +83,10 @@ def test_the_notebook_is_kept_without_outputs() -> None:
 
 
 @pytest.mark.slow
-def test_mission(tmp_path) -> None:
+def test_mission(few_images, tmp_path) -> None:
     """FITS and AEM to kernels that spiceypy loads, with the boresight of the calibration."""
-    params = TINY / 'params.yaml'
-    done = run(tmp_path, EXAMPLES / 'mission.py', TINY, params, tmp_path / 'mission')
+    params = few_images / 'params.yaml'
+    done = run(tmp_path, EXAMPLES / 'mission.py', few_images, params, tmp_path / 'mission')
     assert (done.returncode, done.stderr) == (0, '')
     difference = done.stdout.splitlines()[-1].removeprefix('difference from the calibration: ')
     assert float(difference.split()[0]) < 1e-9

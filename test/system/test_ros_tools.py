@@ -24,7 +24,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from ros_tools import find_tools, HIDDEN, RosTools  # type: ignore[import-not-found]
 from rosbags.convert import convert
 
-from starcal_ground import calibrate_bag
 from starcal_ground.bags import reader
 from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Activation, Ensemble
@@ -45,9 +44,17 @@ Make = Callable[..., RosTools]
 
 
 @pytest.fixture(scope='module')
-def tools(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    found: Path = find_tools(tmp_path_factory.mktemp('ros2tools'))
+def tools(made_once: Callable[..., Path]) -> Path:
+    found: Path = find_tools(made_once)
     return found
+
+
+@pytest.fixture(scope='module')
+def rosbag2(tools: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Skip a test where the libraries of rosbag2 do not load; its commands are missing then."""
+    ros2 = RosTools(tools, FAST, tmp_path_factory.mktemp('rosbag2'), {})
+    if ' record ' not in ros2.run('bag', '--help').stdout:
+        pytest.skip('rosbag2 does not load here')
 
 
 @pytest.fixture
@@ -72,15 +79,8 @@ def ros2(make: Make, request: pytest.FixtureRequest) -> RosTools:
     return make(request.param)
 
 
-def has_rosbag2(ros2: RosTools) -> bool:
-    """Return True if the libraries of rosbag2 load; its commands are missing otherwise."""
-    return ' record ' in ros2.run('bag', '--help').stdout
-
-
-def test_launch_replay_calibrate_and_record(ros2, tiny_bag, tmp_path) -> None:
+def test_launch_replay_calibrate_and_record(rosbag2, ros2, tiny_bag, tmp_path) -> None:
     """The sequence of the README with every launch argument, ended as a terminal ends it."""
-    if not has_rosbag2(ros2):
-        pytest.skip('ros2 bag record does not load here')
     recorded = tmp_path / 'recorded'
     launch = ros2.start(
         *('launch', 'starcal', 'starcal.launch.py', f'params_file:={tiny_bag}/params.yaml'),
@@ -103,10 +103,10 @@ def test_launch_replay_calibrate_and_record(ros2, tiny_bag, tmp_path) -> None:
     static = ros2.run('topic', 'echo', '--once', '/tf_static', 'tf2_msgs/msg/TFMessage')
     assert 'child_frame_id: camera' in static.stdout, static.stderr
     record.until_said("Subscribed to topic '/opnav/calibration'")
-    assert record.interrupt() == 0, record.said()
+    assert record.interrupt_group() == 0, record.said()
     counts = {topic.name: topic.count for topic in reader.topics([recorded])}
     assert counts == {'/opnav/observations': 10, '/opnav/calibration': 1, '/tf_static': 1}
-    launch.interrupt()
+    launch.interrupt_group()
     assert launch.said().count('process has finished cleanly') == 2, launch.said()
 
 
@@ -116,7 +116,7 @@ def test_launch_arguments_are_shown(make) -> None:
         assert shown.returncode == 0 and "'params_file':" in shown.stdout, shown.stderr
 
 
-def test_replay_launch(make, tiny_bag, tmp_path) -> None:
+def test_replay_launch(make, client, tiny_bag, tmp_path) -> None:
     ros2 = make(FAST)
     params = params_with(tmp_path, state_dir=str(tmp_path / 'state'))
     launch = ros2.start(
@@ -124,10 +124,10 @@ def test_replay_launch(make, tiny_bag, tmp_path) -> None:
         *('rate:=0.0', 'loop:=false', 'image:=/opnav/image_raw'),
         'attitude:=/star_tracker/attitude',
     )
-    ros2.until('images: 10\n', *ECHO, '/ensemble_status', STATUS)
-    launch.interrupt()
+    client.until_images(10)
+    launch.interrupt_group()
     assert 'process has died' not in launch.said(), launch.said()
-    if not has_rosbag2(ros2):
+    if ' record ' not in ros2.run('bag', '--help').stdout:  # the libraries do not load
         return
     info = ros2.run('bag', 'info', tmp_path / 'state' / 'ensemble' / '00000001.mcap')
     words = info.stdout.split()
@@ -186,8 +186,9 @@ def test_two_cameras_with_one_frame_are_named(
     client.until(lambda: message('third') == 'calibration active')
 
 
-def test_lifecycle_and_parameters(ros2, tiny_bag, tmp_path) -> None:
+def test_lifecycle_and_parameters(make, tiny_bag, tmp_path) -> None:
     """Each transition by its name; services answer while inactive; a dump can be read again."""
+    ros2 = make(CYCLONE)  # on Fast DDS, test_node_lifecycle.py calls the same services
     node = ros2.start_node(
         *('calibrator', '--params-file', tiny_bag / 'params.yaml'), *('-p', 'autostart:=false')
     )
@@ -218,7 +219,7 @@ def test_lifecycle_and_parameters(ros2, tiny_bag, tmp_path) -> None:
     assert 'star_tracker_sigma_arcsec: ' in refused.stdout + refused.stderr
     dump = tmp_path / 'dump.yaml'
     dump.write_text(ros2.until('min_images: 5', 'param', 'dump', '/calibrator'))
-    assert node.interrupt() == 0
+    assert node.interrupt_group() == 0
     again = ros2.start_node('calibrator', '--params-file', dump)
     ros2.until('Integer value is: 5', 'param', 'get', '/calibrator', 'min_images')
     assert 'not a parameter' not in again.said()
@@ -329,10 +330,10 @@ def as_no_database(folder: Path) -> None:
     ],
     ids=['mcap', 'sqlite', 'damaged', 'cut off', 'no database'],
 )
-def test_without_the_wheels_rosbag2_reads_bags(write, line, make, tmp_path) -> None:
+def test_without_the_wheels_rosbag2_reads_bags(
+    write, line, make, rosbag2, tiny_products, tmp_path
+) -> None:
     ros2 = make(FAST)
-    if not has_rosbag2(ros2):
-        pytest.skip('rosbag2 does not load here')
     write(tmp_path / 'bag')
     (tmp_path / 'sitecustomize.py').write_text(HIDDEN)
     path = f'{tmp_path}:{ROOT}:{ros2.environment["PYTHONPATH"]}'
@@ -355,6 +356,8 @@ def test_without_the_wheels_rosbag2_reads_bags(write, line, make, tmp_path) -> N
         f'out/observations.mcap is not written: mcap or rosbags is not installed: {install}\n'
     )
     assert (done.returncode, done.stderr) == (0, unwritten), done.stderr
-    expected = calibrate_bag(TINY, TINY / 'params.yaml')
-    camera = read_calibration(tmp_path / 'out' / CALIBRATION_FILE).geometry.camera
-    assert camera.parameters.tolist() == expected.geometry.camera.parameters.tolist()
+    camera, expected = (
+        read_calibration(folder / CALIBRATION_FILE).geometry.camera
+        for folder in (tmp_path / 'out', tiny_products)
+    )
+    assert camera.parameters.tolist() == expected.parameters.tolist()

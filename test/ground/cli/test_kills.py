@@ -14,7 +14,6 @@ import contextlib
 import dataclasses
 import functools
 import io
-import json
 import os
 from pathlib import Path
 import random
@@ -26,7 +25,6 @@ from attacks import BAG, digests, many  # type: ignore[import-not-found]
 from mission_files import write_frames  # type: ignore[import-not-found]
 import pytest
 
-from starcal_ground.bags import reader
 from starcal_ground.cli import main
 from starcal_ground.cli.arguments import EXIT_INTERRUPTED
 from starcal_ground.mission.trend.trend_table import Table
@@ -34,16 +32,15 @@ from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
 from starcal_ground.written_files import is_marked, write_marked
 from starcal_ros.errors import StarcalError
-from starcal_ros.formats.products.product_files import read_calibration
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures('forked_readers')]
 
 
 _TIMES_AND_ATTITUDES = '--times in/frames/times.csv --attitude in/frames/attitude.csv'
 COMMANDS = (
     'calibrate in/bag --params in/bag/params.yaml -o out',
     'report out',
-    'lookup in/a -o out/table.csv --points 100',
+    'lookup in/a -o out/table.csv --points 20',
     'undistort in/a in/frames/*.png -o out/straight',
     'simulate --scenario tiny --seed=3 --images=3 -o out/sim',
     'export in/a --to spice --spacecraft-id=-999 -o out',
@@ -201,7 +198,7 @@ def _cut_outputs(
         if name.endswith(('.part', '.log', '-journal')) or digest == before.get(name):
             continue
         # Each run writes the same bytes but those of a trend, which are read.
-        is_read = command.startswith('trend')
+        is_read = name.startswith('trend.')
         sound = _reads(out / name) if is_read else digest == expected.get(name)
         cut += [] if sound else [f'{name} is neither old nor whole']
     # A thumbnail of an earlier calibration may be gone, a product never is.
@@ -209,26 +206,15 @@ def _cut_outputs(
 
 
 def _reads(path: Path) -> bool:
-    """True if a product can be read to its end."""
-    damage: list[str] = []
+    """True if a page or a table of a trend can be read to its end."""
+    if path.suffix == '.html':
+        with path.open('rb') as page:
+            return is_marked(page)
     try:
-        if path.name == 'calibration.json':
-            read_calibration(path)
-        elif path.suffix == '.json':
-            json.loads(path.read_text())
-        elif path.suffix == '.mcap':
-            for _ in reader.read_raw([path], on_damage=damage.append):
-                pass
-        elif path.suffix == '.sqlite':
-            Table(path.parent).rows()
-        elif path.suffix == '.html':
-            with path.open('rb') as page:
-                return is_marked(page)
-        else:
-            return path.stat().st_size > 0
-    except (StarcalError, ValueError, OSError):
+        Table(path.parent).rows()
+    except StarcalError:
         return False
-    return not damage
+    return True
 
 
 def _inputs(folder: Path) -> dict[str, str]:

@@ -25,7 +25,6 @@ from starcal_ground.cli import main, node_processes
 from starcal_ground.cli.arguments import EXIT_INTERRUPTED, parse_time, Selection
 from starcal_ground.cli.commands import compare, demo
 from starcal_ground.cli.main import COMMANDS, parser
-from starcal_ground.written_files import write_marked
 from starcal_ros.constants import software_version
 
 
@@ -171,17 +170,6 @@ def test_a_command_becomes_its_node(starcal, monkeypatch, line, module, argument
     entry = module_command('starcal_ros.entry_points')
     assert called == [[*entry, module, *arguments.split()]]
     assert '.' not in module or importlib.util.find_spec(module)
-
-
-def test_no_report_is_written_where_none_is_wanted(
-    starcal, tmp_path, tiny_bag, tiny_products
-) -> None:
-    write_marked(tmp_path / 'report.html', 'of earlier products')
-    bag, params = tiny_products / 'observations.mcap', tiny_bag / 'params.yaml'
-    status, out, _ = starcal('calibrate', bag, '--params', params, '-o', tmp_path, '--no-report')
-    assert status == 0 and f'\nproducts written to {tmp_path}\n' in out
-    assert (tmp_path / 'calibration.json').is_file()
-    assert not (tmp_path / 'report.html').exists()
 
 
 def test_demo_takes_the_bag_of_the_repository(tmp_path) -> None:

@@ -73,8 +73,16 @@ PLACES = {
 MAY_LACK = ('file of a bag', 'residuals.npz', 'observations.mcap', '--params of trend')
 
 
-@pytest.mark.parametrize('kind', KINDS)
-@pytest.mark.parametrize('name', FILES)
+CASES = [
+    (name, kind)
+    for name in FILES
+    for kind in KINDS
+    # One function opens files for all: where it refuses a pipe, it refuses the others too.
+    if name in ('BAG', '--params') or kind in ('pipe', 'sparse', 'empty', 'garbage', 'other text')
+]
+
+
+@pytest.mark.parametrize(('name', 'kind'), CASES)
 def test_a_file_that_is_none_costs_one_line(name, kind, campaign, tmp_path, starcal) -> None:
     here = tmp_path / 'campaign'
     shutil.copytree(campaign, here)
