@@ -266,7 +266,7 @@ def test_a_rotation_known_roughly_is_confirmed(catalog, width_deg) -> None:
     assert confirm_sky(frame.xy_px, frame.prior, catalog, elsewhere) is None
 
 
-@pytest.mark.parametrize('width_deg', [8, 25, 55])
+@pytest.mark.parametrize('width_deg', [8, 55])
 @pytest.mark.parametrize(('ranges', 'growth', 'is_found'), [
     (FOUND, 1.0, True),
     (FOUND, 1.008, True),
