@@ -50,7 +50,7 @@ from starcal_ros.sky.catalog import load_catalog
 TRUTH = json.loads((TINY / 'truth.json').read_text())
 TRUE_CAMERA = CameraModel(640, 512, np.array([*TRUTH['k_true'], *TRUTH['d_true']]))
 LENS = ('--focal-length-mm', '18', '--pixel-size-um', '10')  # of the small bag, within 1 %
-STATED = {'camera_info_url': str(TINY / 'camera.yaml')}  # a search over all fields takes longer
+CAMERA_FILE = str(TINY / 'camera.yaml')  # with it no search over all fields is made
 
 
 @pytest.mark.slow
@@ -214,7 +214,7 @@ def test_a_zoom_between_the_frames_is_named(tmp_path) -> None:
     frames[2:] = [zoomed(pixels, 1.1) for pixels in frames[2:]]
     folder = write_pngs(tmp_path / 'night', frames)
     with pytest.raises(NotFromStars, match='focal lengths of 180. to 198. px: .* zoom .*take 20'):
-        calibrate_images(folder, **STATED)
+        calibrate_images(folder, camera_info_url=CAMERA_FILE)
 
 
 @pytest.mark.slow
@@ -233,7 +233,8 @@ def test_an_image_with_another_focal_length_is_left_out_and_named() -> None:
 def test_a_change_of_focus_is_refused_by_the_gate(tmp_path) -> None:
     frames = frames_of(6)
     frames[3:] = [zoomed(pixels, 1.005) for pixels in frames[3:]]
-    calibration = calibrate_images(write_pngs(tmp_path / 'night', frames), **STATED)
+    folder = write_pngs(tmp_path / 'night', frames)
+    calibration = calibrate_images(folder, camera_info_url=CAMERA_FILE)
     assert not calibration.accepted
     assert '(max_image_variation_px)' in ' '.join(calibration.reasons)
 

@@ -160,4 +160,5 @@ def compared(one: CameraGeometry, other: CameraGeometry) -> float:
     """Largest difference of two cameras, of parameters and of rotations."""
     turn = one.star_tracker_from_camera.inv() * other.star_tracker_from_camera
     off = np.abs(one.camera.parameters - other.camera.parameters)
-    return max(float((off / np.abs(other.camera.parameters).clip(1.0)).max()), turn.magnitude())
+    relative = off / np.abs(other.camera.parameters).clip(1.0)
+    return max(float(relative.max()), float(turn.magnitude()))
