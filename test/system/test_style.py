@@ -94,7 +94,7 @@ def test_each_file_names_the_holder_and_the_licence_of_the_package() -> None:
         ('starcal_ros/estimation/weights.py', 'test/onboard/estimation/test_weights.py'),
         ('starcal_ros/errors.py', 'test/onboard/test_errors.py'),  # imported by 69 test files
         # Imported by no test, but by the package that the tests import.
-        ('starcal_ros/records/calibration.py', 'test/onboard/records/test_records.py'),
+        ('starcal_ros/records/calibration.py', 'test/onboard/records/test_observations.py'),
         (
             'starcal_ground/cli/commands/plan.py',
             'test/ground/cli/commands/test_plan.py',
