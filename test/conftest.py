@@ -49,7 +49,7 @@ LONGEST = (
     *('test_docs', 'test_problem_mountings', 'test_motion', 'test_deep_catalog', 'test_kills'),
     *('test_worlds', 'test_processes', 'test_search', 'test_tracking', 'test_set_up_mistakes'),
     *('test_lens_models', 'test_object_store', 'test_end_to_end', 'test_unknown_air'),
-    *('test_centroiding', 'test_c_camera', 'test_series_overview', 'test_trend', 'test_state'),
+    *('test_centroiding', 'test_c_camera', 'test_trend_page', 'test_trend', 'test_state'),
     *('test_hostile_state', 'test_ros_tools', 'test_hostile_messages', 'test_plan'),
     *('test_calibrator', 'test_paper', 'test_joining'),
 )

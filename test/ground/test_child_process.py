@@ -15,6 +15,7 @@ from starcal_ground.child_process import module_command
 
 ROOT = Path(__file__).parents[2]
 TOOL = 'starcal_ground.cli.main'
+AS_A_MODULE = [sys.executable, '-m', TOOL]
 # Modules of the standard library and of others that the tool imports, and one it may not.
 PLANTED = ('yaml', 'typing', 'argparse', 'json', 'pickle', 'dataclasses', 'numpy', 'dask', 'rclpy')
 
@@ -36,19 +37,17 @@ def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    'start',
-    [[sys.executable, '-m', TOOL], module_command(TOOL)],
-    ids=['python -m', 'child process'],
-)
-@pytest.mark.parametrize(
-    'arguments',
+    ('start', 'arguments'),
     [
-        ['--version'],
+        (AS_A_MODULE, ['--version']),
         # The lens is stated, so that the search for the camera, whose modules count too, is short.
-        [*('diagnose', 'BAG'), *('--focal-length-mm', '18', '--pixel-size-um', '10')],
-        [*('trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml')],
+        (AS_A_MODULE, ['diagnose', 'BAG', '--focal-length-mm', '18', '--pixel-size-um', '10']),
+        (
+            module_command(TOOL),
+            ['trend', 'BAG', '-o', 'out', '--workers', '1', '--params', 'BAG/params.yaml'],
+        ),
     ],
-    ids=['version', 'diagnose', 'trend'],
+    ids=['version', 'diagnose', 'trend as a child process'],
 )
 def test_modules_of_the_current_folder_are_not_run(hostile, few_images, start, arguments) -> None:
     given = [word.replace('BAG', str(few_images)) for word in arguments]

@@ -197,14 +197,11 @@ def test_recorded_observations_need_no_parameters(tiny_products, starcal) -> Non
 
 
 @pytest.mark.slow
-def test_the_tool_says_it_to_people_and_programs(spoilt, starcal) -> None:
+def test_the_tool_shows_the_verdicts_without_parameters(spoilt, starcal) -> None:
     status, out, _ = starcal('diagnose', spoilt)
     assert status == 0
     assert '5 of 12 images' in out and 'attitude_gap' in out
     assert 'over 2 s' in out and 'too far apart' in out  # this image's, and what it means
-    made = json.loads(starcal('diagnose', spoilt, '--json', '--params', PARAMS).out)['contents']
-    assert made['images'] == 12 and len(made['stars_per_image']) == 5
-    assert made['topics'][0]['kinds'] == {'mono16 640 x 512': 11, 'mono16 640 x 511': 1}
 
 
 def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path, starcal) -> None:
@@ -222,20 +219,18 @@ def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path, starcal) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ('direction', 'cause', 'words'),
+    ('direction', 'words'),
     [
-        ('st_to_inertial', 'none', '10 of 12 images'),
-        ('inertial_to_st', 'attitude_direction', '0 of the first 10 of 12 images'),
+        ('st_to_inertial', '10 of 12 images'),
+        ('inertial_to_st', '0 of the first 10 of 12 images'),
     ],
 )
 def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
-    direction, cause, words, tmp_path, starcal
+    direction, words, tmp_path, starcal
 ) -> None:
     last = tiny_images()[-1]
     later = (Image(last.time_ns + k * 10**11, last.pixels) for k in (1, 2))
     path = write_tiny(tmp_path / 'more.mcap', later, ())
     params = params_with(tmp_path, attitude_direction=direction)
     answer = starcal('diagnose', TINY, path, '--params', params)
-    assert answer.status == (3 if cause != 'none' else 0) and words in answer.words
-    answer = starcal('diagnose', TINY, path, '--params', params, '--json')
-    assert json.loads(answer.out)['cause'] == cause
+    assert answer.status == (3 if words.startswith('0') else 0) and words in answer.words

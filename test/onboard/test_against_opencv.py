@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project, project_jacobians
+from starcal_ros.camera import CameraModel, project, project_jacobians
 from starcal_ros.camera.lens import LENSES, ros_distortion
 
 
@@ -85,11 +85,3 @@ def test_derivatives_of_every_model(model: str) -> None:
     np.testing.assert_allclose(ours / size, theirs / size, rtol=0, atol=1e-11)
     # OpenCV turns the star, we turn the frame: the other sign at zero rotation.
     np.testing.assert_allclose(J_rotation, -rotation, rtol=0, atol=1e-11 * 1500)
-
-
-@pytest.mark.parametrize('model', [lens.name for lens in LENSES.values() if lens.opencv])
-def test_line_of_sight_of_every_model(model: str) -> None:
-    camera = random_lens(model, 11).replace(fx=3000.0, fy=3001.0)  # no fold within the detector
-    e = line_of_sight(camera, pixel_grid(camera, 25, 20))
-    expected, _ = opencv_of(camera, e)
-    np.testing.assert_allclose(expected, pixel_grid(camera, 25, 20), rtol=0, atol=1e-9)

@@ -55,9 +55,9 @@ def night_of(scenario: synthetic.Scenario, stamps_ns: Any, sent: Any) -> Night:
 
 
 @functools.cache
-def slewing_night() -> Night:
+def slewing_night(images: int = 3) -> Night:
     """
-    Four images, 20 s apart, of a spacecraft that slews 1 to 3 degrees a second about no one axis.
+    Up to four images, 20 s apart; the spacecraft slews 1 to 3 degrees a second about no one axis.
 
     The attitude is reported each half second for 100 s before and after, without noise.
     """
@@ -80,7 +80,7 @@ def slewing_night() -> Night:
     scenario = dataclasses.replace(
         synthetic.scenario('tiny', seed=3),
         pointing=synthetic.Inertial(tuple(fields)),
-        image_count=count,
+        image_count=images,
         cadence_s=step_s,
         start_ns=START_NS + 3_000000000,
     )
@@ -109,7 +109,7 @@ def granasat_night() -> Night:
     order = np.argsort(stamps_ns)
     quaternions = np.array([quaternion for _, quaternion in sent])[order]
     return Night(
-        tuple(images[2:6]),  # the first two carry an attitude of something else
+        tuple(images[2:5]),  # the first two carry an attitude of something else
         WireAttitudes(stamps_ns[order], quaternions),
         load_setup({}, prior=CameraGeometry(camera, np.array(prior['align_prior_xyzw']))),
     )
@@ -197,6 +197,16 @@ def rolled(degrees: float) -> Change:
 
 half_turned = rolled(180.0)
 mirrored = of_pixels(lambda pixels: pixels[:, ::-1])
+
+
+def with_all_images(night: Night) -> Night:
+    """Add the fourth image, where three do not show the mistake."""
+    return dataclasses.replace(night, images=slewing_night(4).images)
+
+
+def one_image(night: Night) -> Night:
+    """Take one image, where several take long and show no more."""
+    return dataclasses.replace(night, images=night.images[1:2])
 
 
 @of_pixels
@@ -377,7 +387,6 @@ def expanded(pixels: Any) -> Any:
         ([conjugated], ['attitude_direction'], 'inertial_to_st', 'on: inertial_to_st'),
         ([with_direction('inertial_to_st')], ['attitude_direction'], 'st_to_inertial', ''),
         ([rolled(-90.0)], ['rotated'], 90.0, ''),
-        ([half_turned], ['rotated'], 180.0, ''),
         ([mirrored], ['mirrored'], 'left to right', ''),
         ([of_pixels(lambda p: p[::-1])], ['mirrored'], 'top to bottom', ''),
         ([of_pixels(lambda p: p[::-1, ::-1])], ['rotated'], 180.0, ''),
@@ -393,17 +402,7 @@ def expanded(pixels: Any) -> Any:
         ([smeared(40)], ['smear'], pytest.approx(13, abs=2), 'at least'),
         ([curved], ['not_linear'], None, ''),
         ([of_something_else], ['unknown'], None, ''),
-        # Two mistakes.
-        ([conjugated, off(40)], ['attitude_direction', 'prior_alignment'], None, ''),
         ([conjugated, half_turned], ['attitude_direction', 'rotated'], None, ''),
-        ([conjugated, unaligned], ['attitude_direction', 'prior_alignment'], None, ''),
-        ([conjugated, w_first], ['quaternion_order', 'attitude_direction'], None, ''),
-        ([w_first, off(6)], ['quaternion_order', 'prior_alignment'], None, ''),
-        ([w_first, unaligned], ['quaternion_order', 'prior_alignment'], None, ''),
-        ([half_turned, off(12)], ['prior_alignment'], None, ''),
-        ([late(20.0), conjugated], ['attitude_direction', 'clock'], None, ''),
-        ([late(20.0), unaligned], ['clock', 'prior_alignment'], None, ''),
-        ([conjugated, mirrored], ['mirrored', 'attitude_direction'], None, ''),
     ],
 )
 def test_mistakes_of_a_rendered_and_of_a_real_night(
@@ -444,15 +443,15 @@ def test_alignment_by_stars_among_the_structure_of_a_corona(catalog) -> None:
         return np.minimum(pixels + light, 4095.0).astype(pixels.dtype)
 
     change = together(of_pixels(with_corona), turned(Rotation.from_rotvec([0.4, 0.3, 1.0])))
-    found = found_in(change(slewing_night()), catalog)
+    found = found_in(change(slewing_night(4)), catalog)
     assert (found.cause, found.images) == ('prior_alignment', 3)
 
 
 @pytest.mark.parametrize(
     ('night_of', 'late_s'),
     [
-        *[(slewing_night, late_s) for late_s in (-47.0, -1.5, 3.0, 58.0)],
-        *[(granasat_night, late_s) for late_s in (-41.0, 33.0)],
+        *[(slewing_night, late_s) for late_s in (-47.0, -1.5, 58.0)],
+        (granasat_night, 33.0),
     ],
 )
 def test_clock(catalog, night_of, late_s) -> None:
@@ -476,7 +475,7 @@ def at_rest(count: int) -> Night:
     return night_of(scenario, stamps_ns, sent)
 
 
-@pytest.mark.parametrize('count', [1, 4])
+@pytest.mark.parametrize('count', [1, 3])
 def test_images_that_do_not_turn(catalog, count) -> None:
     resting = at_rest(count)
     assert found_in(resting, catalog).cause == 'none'
@@ -499,6 +498,15 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
 @pytest.mark.parametrize(
     ('changes', 'causes', 'words'),
     [
+        # Two mistakes.
+        ([conjugated, off(40)], ['attitude_direction', 'prior_alignment'], 'inertial_to_st'),
+        ([conjugated, unaligned], ['attitude_direction', 'prior_alignment'], 'inertial_to_st'),
+        ([conjugated, w_first], ['quaternion_order', 'attitude_direction'], 'sent with w first'),
+        ([w_first, off(6)], ['quaternion_order', 'prior_alignment'], 'sent with w first'),
+        ([half_turned, off(12)], ['prior_alignment'], 'prior_alignment'),
+        ([late(20.0), conjugated], ['attitude_direction', 'clock'], 'stamp_offset_s: -20'),
+        ([late(20.0), unaligned], ['clock', 'prior_alignment'], 'stamp_offset_s: -20'),
+        ([conjugated, mirrored], ['mirrored', 'attitude_direction'], 'mirrored left to right'),
         # Inertial axes: those with a name, two reversed, any fixed ones.
         ([in_axes(GALACTIC)], ['axes'], 'in axes of the galactic system, not of the ICRF'),
         ([with_the_earth], ['axes'], 'in axes of the rotating Earth, not of the ICRF'),
@@ -525,7 +533,6 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
         ([inverse_alignment], ['prior_alignment'], 'the inverse of it: camera from star tracker'),
         ([of_camera], ['prior_alignment'], 'the attitudes are those of the camera itself'),
         # The camera matrix.
-        ([with_centre(0.3, 0.2)], ['principal_point'], 'The principal point of the prior camera'),
         (
             [with_centre(0.3, 0.2), off(40)],
             ['principal_point', 'prior_alignment'],
@@ -543,9 +550,11 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
         ),
         ([region(0.25, 0.95, 0.1, 0.8)], ['wrong_size'], 'a region of the detector (roi of'),
         # Half as wide and high, but no bins: the stars tell.
-        ([region(0.4, 0.9, 0.1, 0.6)], ['wrong_size'], 'a region of the detector (roi of'),
-        ([binned], ['wrong_size'], 'binned 2 x 2 (binning_x, binning_y of CameraInfo)'),
-        ([binned, with_size], ['focal_length'], 'is of pixels before 2 x 2 binning'),
+        (
+            [with_all_images, region(0.4, 0.9, 0.1, 0.6)],
+            ['wrong_size'],
+            'a region of the detector (roi of',
+        ),
         ([binned, off(40)], ['wrong_size', 'prior_alignment'], 'prior_alignment points'),
         ([of_pixels(lambda p: p.T)], ['mirrored', 'rotated'], 'sides are those'),
         ([expanded], ['not_linear'], 'a tone curve that they never had'),
@@ -553,9 +562,12 @@ ONE_SIGN = sent_as([0, 1, 2, 3], (1, 1, -1, 1))
         # the images are identified in bins of pixels only. None where they are measured.
         ([blurred(disc(4.0, 2.0))], ['one_shape'], 'All stars are wide discs or rings alike'),
         ([blurred(disc(5.0))], ['one_shape'], 'focus the lens'),
-        ([blurred(disc(8.0), 'no_match')], ['one_shape'], 'in bins of 4 x 4 pixels only'),
-        ([blurred(disc(9.0, 5.0), 'no_match')], ['one_shape'], 'in bins of 4 x 4 pixels only'),
-        ([blurred(comet)], ['one_shape'], 'All stars are elongated alike, '),
+        (
+            [one_image, blurred(disc(9.0, 5.0), 'no_match')],
+            ['one_shape'],
+            'in bins of 4 x 4 pixels only',
+        ),
+        ([with_all_images, blurred(comet)], ['one_shape'], 'All stars are elongated alike, '),
         ([blurred(disc(4.0, 2.0)), conjugated], ['attitude_direction'], 'quaternions are'),
         ([blurred(disc(3.0), '')], [], 'Attitudes, alignment and camera fit the images.'),
         # What a calibration can take up is nobody's mistake.
@@ -577,17 +589,23 @@ def test_a_mistake_is_named_and_nothing_else(changes, causes, words, catalog) ->
 
 def test_the_numbers_of_a_camera_matrix(catalog) -> None:
     """Those that go into the camera file are right."""
-    night = slewing_night()
+    night = slewing_night(4)
     fx, cx, cy = (float(night.setup.prior.camera.parameters[k]) for k in (0, 3, 4))
     found = found_in(with_centre(0.3, 0.2)(night), catalog)
-    assert isinstance(found.found, list)
+    assert found.cause == 'principal_point' and isinstance(found.found, list)
+    assert found.sentence.startswith('The principal point of the prior camera')
     # The prior is off by 4 px, which the stars show to 1.
     assert found.found == pytest.approx([cx, cy], abs=7.0)
     assert found.mend == (
         f'# in the file of camera_info_url: cx = {found.found[0]}, cy = {found.found[1]}',
     )
-    for change in (binned, together(binned, with_size)):
+    for change, cause, words in (
+        (binned, 'wrong_size', 'binned 2 x 2 (binning_x, binning_y of CameraInfo)'),
+        (together(binned, with_size), 'focal_length', 'is of pixels before 2 x 2 binning'),
+    ):
         found = found_in(change(night), catalog)
+        assert (found.cause, found.also) == (cause, ())
+        assert words in ' '.join([found.sentence, *found.evidence, *found.mend])
         numbers = [float(n) for n in found.mend[0].rpartition('= ')[2].split(', ')]
         # Pixel 0 of 2 x 2 is at 0.5 of the detector.
         expected = [fx / 2, fx / 2, (cx + 0.5) / 2 - 0.5, (cy + 0.5) / 2 - 0.5]
@@ -599,8 +617,6 @@ def test_the_numbers_of_a_camera_matrix(catalog) -> None:
     [
         (37.0, '37 s is TAI - UTC'),
         (-18.0, '18 s is GPS time - UTC'),
-        (69.184, '69 s is TT - UTC'),
-        (7200.0, '2 h is the difference of two time zones'),
         (-12600.0, '3.5 h is the difference of two time zones'),
     ],
 )

@@ -69,9 +69,10 @@ def words_on(frames: list[Pixels]) -> dict[int, str]:
     return {time_ns // S - 1: words for time_ns, words in copies.items()}
 
 
-@pytest.mark.parametrize('shift_px', [0.0, 0.5])
-@pytest.mark.parametrize('pattern', [0.0, 5.0])
-@pytest.mark.parametrize(('psf_px', 'faint'), [(0.5, 2500), (1.3, 2500), (1.0, 0)])
+@pytest.mark.parametrize(
+    ('psf_px', 'faint', 'pattern', 'shift_px'),
+    [(0.5, 2500, 0.0, 0.0), (0.5, 2500, 5.0, 0.5), (1.3, 2500, 5.0, 0.0), (1.0, 0, 0.0, 0.5)],
+)
 def test_exposures_of_one_field_and_camera_are_no_copies(psf_px, faint, pattern, shift_px) -> None:
     light = sky(1, psf_px, faint)
     assert not words_on([exposed(light, k, shift_px, pattern) for k in range(5)])
@@ -88,10 +89,9 @@ COPIES: dict[str, Callable[[Pixels], Pixels]] = {
 }
 
 
-@pytest.mark.parametrize('pattern', [0.0, 3.0])
 @pytest.mark.parametrize('name', COPIES)
-def test_an_exposure_encoded_again_is_a_copy(name, pattern) -> None:
-    frames = [exposed(sky(k), k, pattern=pattern) for k in range(4)]
+def test_an_exposure_encoded_again_is_a_copy(name) -> None:
+    frames = [exposed(sky(k), k, pattern=3.0) for k in range(4)]
     again = COPIES[name](frames[0])
     (number, words), *others = words_on([*frames, again]).items()
     assert number == 4 and not others

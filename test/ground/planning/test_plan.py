@@ -83,7 +83,7 @@ def test_the_images_then_give_the_sigma_that_was_expected(setup, ensemble, plann
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize('name', ['map', 'line_of_sight', 'fx'])
+@pytest.mark.parametrize('name', ['map', 'fx'])
 def test_a_forecast_falls_and_depends_on_the_set_of_images_alone(setup, ensemble, name) -> None:
     """No draw decides: a sigma rises with no image, and equal images have equal effects."""
     here, there = Pointing(10.0, 40.0, 5.0), Pointing(200.0, -20.0, 70.0)

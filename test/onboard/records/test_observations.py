@@ -1,12 +1,20 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""Codes of star refusals, and their names in messages and files."""
+"""Codes of star refusals and their names; covariance of a field as factor and remainder."""
 
 from __future__ import annotations
 
-import numpy as np
+import dataclasses
 
+import numpy as np
+import pytest
+
+from starcal_ros.assessment.lookup import Derivatives, line_of_sight_table
+from starcal_ros.camera import CameraModel, pixel_grid
+from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.records import (
     Ensemble,
+    factored_field,
+    MapCovariance,
     refused_image,
     STAR_REFUSALS,
     StarObservations,
@@ -32,3 +40,57 @@ def test_an_image_is_used_until_it_is_refused() -> None:
     refused = refused_image(5, 640, 512, 'no_match', 'three stars')
     assert (refused.refusal, refused.detail) == ('no_match', 'three stars')
     assert Ensemble().add(used).images and not Ensemble().add(refused).images
+
+
+OCTAVES = 3
+TERMS = term_count(1296, 1024, OCTAVES)
+LENS = CameraModel(1296, 1024, np.array([3641.5, -0.7, 3642.3, 647.5, 511.5, -0.05, 0.1, 0, 0, 0]))
+CAMERA = dataclasses.replace(LENS, field=DetectorField(1296, 1024, OCTAVES, np.zeros((2, TERMS))))
+SIGMA = np.r_[0.3, 0.1, 0.3, 0.5, 0.5, 1e-3, 1e-2, 1e-1, 1e-4, 1e-4, np.full(3, 2e-5)]
+
+
+def covariance(stars: int, held: bool = False) -> MapCovariance:
+    """Of a calibration whose parameters and field cancel in what the stars have seen."""
+    sigma = np.r_[300.0 * SIGMA, np.full(2 * TERMS, 0.05)]  # without stars
+    if held:
+        sigma[7] = 0.0
+    pixels = np.random.default_rng(stars).uniform(size=(stars, 2)) * [1296, 1024] - 0.5
+    J = Derivatives.at(CAMERA, pixels).J.reshape(-1, len(sigma))
+    root = J * sigma * LENS.parameters[0] / 0.1  # stars of 0.1 px
+    inverse = np.linalg.inv(root.T @ root + np.eye(len(sigma)))
+    return MapCovariance(inverse * sigma * sigma[:, None], 0.002)
+
+
+@pytest.mark.parametrize('stars', [3, 50, 2000])
+@pytest.mark.parametrize('held', [False, True], ids=['free', 'held'])
+def test_every_sigma_of_a_line_of_sight_holds_to_a_thousandth(stars: int, held: bool) -> None:
+    given = covariance(stars, held)
+    assert CAMERA.field is not None
+    record = factored_field(CAMERA.field, given)
+    pixels = pixel_grid(CAMERA, 61, 47)
+    expected = line_of_sight_table(CAMERA, given, pixels)
+    found = line_of_sight_table(
+        CAMERA, MapCovariance(record.covariance, record.unresolved_px), pixels
+    )
+    for name in ('sigma_arcsec', 'shape_sigma_arcsec'):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3)
+    np.testing.assert_allclose(
+        np.diag(record.covariance)[:13], np.diag(given.matrix)[:13], rtol=1e-7
+    )  # exactly zero where held
+    assert np.linalg.eigvalsh(record.covariance).min() > -1e-9 * np.trace(record.covariance)
+
+
+def test_the_record_is_a_quarter_of_the_square() -> None:
+    assert CAMERA.field is not None
+    record = factored_field(CAMERA.field, covariance(300))
+    numbers = (record.covariance_factor, record.remainder_unit_px, record.remainder)
+    square = record.covariance.nbytes
+    assert sum(one.nbytes for one in numbers) < 0.25 * square
+
+
+def test_a_field_without_variance_has_none() -> None:
+    assert CAMERA.field is not None
+    matrix = np.zeros((13 + 2 * TERMS,) * 2)
+    matrix[:13, :13] = np.diag(SIGMA**2)
+    record = factored_field(CAMERA.field, MapCovariance(matrix))
+    np.testing.assert_allclose(record.covariance, matrix, rtol=1e-8, atol=1e-30)

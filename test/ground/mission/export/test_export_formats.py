@@ -282,9 +282,16 @@ def test_no_rotation_is_exported_to_a_star_tracker_that_does_not_exist(kind, tmp
 CENTER = ('BORESIGHT_SAMPLE', 'BORESIGHT_LINE')
 
 
-@pytest.mark.parametrize('pixel_size_um', [0.0, 5.5])
-@pytest.mark.parametrize('with_field', [False, True])
-@pytest.mark.parametrize('model', ['plumb_bob', 'thin_prism', 'equidistant'])
+@pytest.mark.parametrize(
+    ('model', 'with_field', 'pixel_size_um'),
+    [
+        ('plumb_bob', False, 0.0),
+        ('plumb_bob', True, 5.5),
+        ('thin_prism', False, 5.5),
+        ('equidistant', False, 0.0),
+        ('equidistant', True, 0.0),
+    ],
+)
 def test_isis_keywords_have_the_error_they_state(
     tmp_path, model, with_field, pixel_size_um
 ) -> None:

@@ -9,6 +9,7 @@ import hashlib
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 import re
+import shutil
 import threading
 import urllib.parse
 from xml.sax.saxutils import escape
@@ -17,6 +18,7 @@ import fsspec
 from mission_files import TINY  # type: ignore[import-not-found]
 import pytest
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
+from trend_rows import write  # type: ignore[import-not-found]
 
 from starcal_ground.mission.trend import fleet
 from starcal_ground.mission.trend.trend_table import Row, Table
@@ -42,23 +44,22 @@ class Store(ThreadingHTTPServer):
 
     daemon_threads = True
 
-    def __init__(self, bag: Path) -> None:
+    def __init__(self) -> None:
         super().__init__(('127.0.0.1', 0), Handler)
         self.url = f'http://127.0.0.1:{self.server_port}'
-        self._bag = bag
         self.objects: dict[str, bytes] = {}
         self.faults: dict[str, int] = {}
         self.requests: list[str] = []
         self.is_closing = threading.Event()
 
-    def reset(self) -> None:
-        """Two bags, and no fault."""
-        self.objects, self.faults, self.requests = {}, {}, []
-        content = (self._bag / 'tiny_0.mcap').read_bytes()
-        for k in range(2):
-            changed = content.replace(b'starcal', b'%07d' % k, 1)  # in the header, not read
-            self.objects[f'fleet/{k}/tiny_0.mcap'] = changed
-            self.objects[f'fleet/{k}/metadata.yaml'] = (self._bag / 'metadata.yaml').read_bytes()
+    def reset(self, folder: Path) -> None:
+        """The files below a folder, and no fault."""
+        self.faults, self.requests = {}, []
+        self.objects = {
+            f'fleet/{path.relative_to(folder)}': path.read_bytes()
+            for path in folder.rglob('*')
+            if path.is_file()
+        }
 
     def handle_error(self, *_: object) -> None:
         """Say nothing where a client has left."""
@@ -130,8 +131,8 @@ class Handler(BaseHTTPRequestHandler):
 
 
 @pytest.fixture(scope='module')
-def server(few_images: Path) -> Iterator[Store]:
-    made = Store(few_images)
+def server() -> Iterator[Store]:
+    made = Store()
     threading.Thread(target=made.serve_forever, daemon=True).start()
     with pytest.MonkeyPatch.context() as patch:
         settings = {'ACCESS_KEY_ID': 'a', 'SECRET_ACCESS_KEY': 'b', 'ENDPOINT_URL': made.url}
@@ -149,22 +150,29 @@ def server(few_images: Path) -> Iterator[Store]:
 
 
 @pytest.fixture
-def store(server: Store) -> Iterator[Store]:
-    server.reset()
+def store(server: Store, tmp_path: Path) -> Iterator[Store]:
+    """The server with two calibrations."""
+    for k in range(2):
+        write(tmp_path / 'there' / str(k), k)
+    server.reset(tmp_path / 'there')
     yield server
     gc.collect()
 
 
 @pytest.fixture
 def trend(tmp_path: Path, starcal: Starcal) -> Starcal:
-    given = ['-o', tmp_path, '--params', TINY / 'params.yaml']
+    given = ['-o', tmp_path / 'out', '--params', TINY / 'params.yaml']
     return lambda *more, root=_FLEET: starcal('trend', root, *given, *more)
 
 
-def test_bags_are_fetched_by_workers_and_read_once(store, tmp_path, trend) -> None:
-    assert '2 new, 0 known, 0 failed' in trend('--workers', 2).out
+def test_bags_are_fetched_by_a_worker_and_read_once(store, few_images, tmp_path, trend) -> None:
+    for k in range(2):
+        bag = shutil.copytree(few_images, tmp_path / 'bags' / str(k)) / 'tiny_0.mcap'
+        bag.write_bytes(bag.read_bytes().replace(b'starcal', b'%07d' % k, 1))  # in the header
+    store.reset(tmp_path / 'bags')
+    assert '2 new, 0 known, 0 failed' in trend('--workers', 1).out
     assert sum('GET' in line and 'mcap' in line for line in store.requests) == 2
-    paths = sorted(row.path for row in Table(tmp_path).rows())
+    paths = sorted(row.path for row in Table(tmp_path / 'out').rows())
     assert paths == [f'{_FLEET}/{k}' for k in range(2)]
     store.requests.clear()
     assert '0 new, 2 known, 0 failed' in trend().out
@@ -187,27 +195,28 @@ def test_a_store_that_cannot_be_listed_is_one_line(store, trend, case) -> None:
     assert_refused(trend(root=root), words)
 
 
-FAULTS = {  # of requests of one bag, and the reason of its row
-    'dropped': ({'GET /archive/fleet/0/.*mcap': 0}, 'ConnectionClosedError: '),
-    'never answered': ({'GET /archive/fleet/0/.*mcap': -1}, 'ReadTimeoutError: '),
-    'cut off': ({'GET /archive/fleet/0/.*mcap': -2}, ''),
-    'forbidden': ({'/archive/fleet/0/.*mcap': 403}, 'PermissionError: '),
-    'overloaded': ({'GET /archive/fleet/0/.*mcap': 503}, 'SlowDown'),
-    'gone': ({'/archive/fleet/0/.*mcap': 404}, ''),
+FAULTS = {  # of requests of one calibration, and the reason of its row
+    'dropped': ({'GET /archive/fleet/0/': 0}, 'ConnectionClosedError: '),
+    'never answered': ({'GET /archive/fleet/0/': -1}, 'ReadTimeoutError: '),
+    'cut off': ({'GET /archive/fleet/0/': -2}, ''),
+    'forbidden': ({'/archive/fleet/0/': 403}, 'PermissionError: '),
+    'overloaded': ({'GET /archive/fleet/0/': 503}, 'SlowDown'),
+    'gone': ({'/archive/fleet/0/': 404}, ''),
 }
 
 
 @pytest.mark.parametrize('fault', FAULTS)
-def test_a_bag_that_cannot_be_fetched_fails_and_passes(store, tmp_path, trend, fault) -> None:
+def test_a_file_that_cannot_be_fetched_fails_and_passes(store, tmp_path, trend, fault) -> None:
     store.faults, reason = FAULTS[fault]
     status, out, _ = trend()
     assert status == 0
     assert '1 new, 0 known, 1 failed' in out
     (line,) = [line for line in out.splitlines() if line.startswith('failed: ')]
-    assert f'{_FLEET}/0: ' in line and 'cannot be read: ' in line and reason in line
+    assert f'{_FLEET}/0/calibration.json: ' in line
+    assert 'cannot be read: ' in line and reason in line
     store.faults = {}
     assert '1 new, 1 known, 0 failed' in trend().out
-    assert [row.error for row in Table(tmp_path).rows()] == ['', '']
+    assert [row.error for row in Table(tmp_path / 'out').rows()] == ['', '']
 
 
 def test_a_store_that_falls_silent_ends_the_run(store, tmp_path, trend, monkeypatch) -> None:
@@ -221,8 +230,8 @@ def test_a_store_that_falls_silent_ends_the_run(store, tmp_path, trend, monkeypa
     with monkeypatch.context() as patch:
         patch.setattr(fleet, 'compute', while_silent)
         assert_refused(trend(), f'{_FLEET}: cannot be read: ReadTimeoutError: ')
-    assert Table(tmp_path).rows() == []
-    store.faults = {'GET /archive/fleet/0/.*mcap': -1}
+    assert Table(tmp_path / 'out').rows() == []
+    store.faults = {'GET /archive/fleet/0/': -1}
     assert '1 new, 0 known, 1 failed' in trend().out
     store.faults = {}
     assert '1 new, 1 known, 0 failed' in trend().out

@@ -126,27 +126,6 @@ def test_every_distortion_model_of_ros(tmp_path, ros_model, D, model, expected) 
     assert (again.model, again.parameters.tolist()) == (model, camera.parameters.tolist())
 
 
-@pytest.mark.parametrize(
-    ('model', 'coefficients'),
-    [
-        ('plumb_bob', [-0.05, 0.1, 0.01, 5e-4, 3e-5]),
-        ('equidistant', [-0.02, 0.01, -0.004, 5e-4]),
-        ('tilted', [0.1, 0.05, 0.01, 1e-3, -7e-4, 0.35, 0.1, 0.02, 0, 0, 0, 0, 0.01, -0.02]),
-    ],
-)
-def test_skew_of_every_model_goes_out_as_the_best_fit(tmp_path, model, coefficients) -> None:
-    camera = CameraModel(
-        1296, 1024, np.array([1800.0, 2.0, 1801.0, 650.0, 510.0, *coefficients]), model
-    )
-    write_camera_info(camera, tmp_path / 'camera.yaml')
-    back = read_camera_info(tmp_path / 'camera.yaml')
-    fitted, worst_px = camera.ros_fit
-    assert back.model == model and back.parameters.tobytes() == fitted.parameters.tobytes()
-    # Dropped, skew leaves at most skew y', half the height over the focal length; the least
-    # squares may be worse in a corner.
-    assert back.intrinsics[1] == 0.0 and 0.0 < worst_px < 1.3 * 2.0 * 512 / 1800
-
-
 def test_package_urls_follow_ament_prefixes(tmp_path, monkeypatch) -> None:
     first, second = tmp_path / 'first', tmp_path / 'second'
     (first / 'share' / 'other').mkdir(parents=True)
