@@ -17,7 +17,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from starcal_ground.alignment import aligned_by
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.topics import OnImage, Topics, Wanted
@@ -271,5 +270,5 @@ def ensemble_of(observations: Iterable[StarObservations], setup: Setup) -> Ensem
     for image in observations:
         ensemble = ensemble.add(solve.checked(image, setup))
         if len(ensemble.images) >= 2 * setup.calibration.max_images:
-            ensemble = solve.within_limit(ensemble, aligned_by(ensemble, setup))
-    return solve.within_limit(ensemble, aligned_by(ensemble, setup))
+            ensemble = solve.within_limit(ensemble, setup)
+    return solve.within_limit(ensemble, setup)

@@ -10,12 +10,11 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from starcal_ground.alignment import aligned_by
 from starcal_ros.arrays import Floats
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.pipeline.solve import calibration_of, estimated
+from starcal_ros.pipeline.solve import aligned_by, calibration_of, estimated
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.record_fields import Record, Shape, Within
 from starcal_ros.records import Calibration, Ensemble

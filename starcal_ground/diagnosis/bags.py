@@ -13,7 +13,6 @@ import re
 import erfa
 import numpy as np
 
-from starcal_ground.alignment import aligned
 from starcal_ground.bags import reader
 from starcal_ground.bags import topics as bag_topics
 from starcal_ground.bags.frames import read_frames, read_telemetry
@@ -26,7 +25,7 @@ from starcal_ros.assessment.remedies import REMEDIES
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.errors import BagError, ImageRefused
 from starcal_ros.pipeline.observe import check_order
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.records import Image, IMAGE_REFUSALS, refused_image, StarObservations, StarRefusal
 from starcal_ros.sky.attitude import AttitudeOptions
 from starcal_ros.sky.catalog import sky_circle

@@ -22,7 +22,6 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.alignment import aligned_by
 from starcal_ground.campaign import Campaign
 from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.assessment.budget import mean_squares
@@ -50,7 +49,7 @@ from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions, EntryInputs, IMAGE_ROTATION, unknowns_of
 from starcal_ros.identification.prediction import predict
 from starcal_ros.pipeline.setup import Setup
-from starcal_ros.pipeline.solve import estimated
+from starcal_ros.pipeline.solve import aligned_by, estimated
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import Ensemble, GateCheck, StarObservations
 from starcal_ros.text import significant

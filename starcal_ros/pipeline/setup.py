@@ -43,7 +43,7 @@ from starcal_ros.formats.products import camera_yaml
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.options import option
 from starcal_ros.pipeline.detector_frames import DetectorFrames, NO_FRAMES, read_detector_frames
-from starcal_ros.records import CameraGeometry
+from starcal_ros.records import CameraGeometry, FOUND
 from starcal_ros.sky.astrometry import SiteOptions
 from starcal_ros.sky.attitude import AttitudeOptions, Mounting
 from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, load_catalog, StarCatalog
@@ -163,7 +163,7 @@ class SetupOptions:
     prior_alignment: tuple[float, ...] = option(
         (0.0, 0.0, 0.0, 0.0),
         'prior orientation of the camera in the star tracker frame, a quaternion (x, y, z, w);'
-        ' zeros: not given; the nodes on board need it, the tool and setup_finder find it',
+        ' zeros: not given; star_observer needs it, the tool and setup_finder find it',
         length=4,
         basic=True,
     )
@@ -397,21 +397,11 @@ def load_setup(values: Mapping[str, object], prior: CameraGeometry | None = None
     )
 
 
-def load_stated_setup(values: Mapping[str, object]) -> Setup:
-    """
-    The setup of a node on board, which finds no part of it by itself.
-
-    Raises as `load_setup`, and OptionError without a prior alignment, or for a camera on the
-    ground without a site.
-    """
-    setup = load_setup(values)
-    check_site(setup.site)
-    if not setup.is_aligned:
-        raise OptionError(
-            'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'
-            ' setup_finder beside the camera'
-        )
-    return setup
+def aligned(setup: Setup, star_tracker_from_camera_xyzw: Floats) -> Setup:
+    """A copy of a setup with the prior alignment found from the images."""
+    prior = CameraGeometry(setup.prior.camera, star_tracker_from_camera_xyzw)
+    found = ', '.join(filter(None, (setup.origin.get(FOUND), 'alignment')))
+    return replace(setup, prior=prior, is_aligned=True, origin={**setup.origin, FOUND: found})
 
 
 def with_method(setup: Setup, method: str, estimate: Sequence[str]) -> Setup:

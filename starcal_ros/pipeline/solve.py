@@ -14,6 +14,7 @@ import json
 import math
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment import observability
@@ -28,7 +29,8 @@ from starcal_ros.constants import ARCSECOND_RAD, software_version
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.identification.star_finder import realigned
+from starcal_ros.pipeline.setup import aligned, Setup
 from starcal_ros.processes import one_blas_thread
 from starcal_ros.records import (
     Calibration,
@@ -43,6 +45,7 @@ from starcal_ros.records import (
 _FEWEST_STARS = 3  # two fit their mirror image
 _SHOWING = 50  # stars, from bright to faint, show the constellation as well as all
 _MOST_OFF = 0.5  # misfit in RMS sizes of a constellation; a mirrored one misfits by 1.4
+_ALIGNING = 20  # images, of whose alignments the middle one is taken
 
 
 def add_to_ensemble(ensemble: Ensemble, observations: StarObservations, setup: Setup) -> Ensemble:
@@ -87,15 +90,33 @@ def _shows_its_stars(observations: StarObservations, camera: CameraModel) -> boo
     return math.sqrt(max(off2, 0.0) / len(lines)) <= _MOST_OFF * spread
 
 
+def aligned_by(ensemble: Ensemble, setup: Setup) -> Setup:
+    """The setup; where it has no prior alignment, with that of the middle one of the images."""
+    if setup.is_aligned or not ensemble.images:
+        return setup
+    shown = Rotation.from_quat(
+        np.array(
+            [
+                realigned(setup.prior, image).star_tracker_from_camera_xyzw
+                for image in ensemble.images[:_ALIGNING]
+            ]
+        )
+    )
+    apart = np.abs(shown.as_quat() @ shown.as_quat().T)  # cosines of half angles
+    return aligned(setup, shown[int(np.median(apart, axis=1).argmax())].as_quat())
+
+
 @one_blas_thread()
 def within_limit(ensemble: Ensemble, setup: Setup) -> Ensemble:
     """Return the ensemble without its least informative images, down to ``max_images``."""
+    setup = aligned_by(ensemble, setup)
     return observability.keep_most_informative(ensemble, setup.prior, setup.calibration)
 
 
 @one_blas_thread()
 def ensemble_status(ensemble: Ensemble, setup: Setup) -> EnsembleStatus:
     """Images and stars collected, and the predicted precision of a calibration from them."""
+    setup = aligned_by(ensemble, setup)
     return observability.ensemble_status(ensemble, setup.prior, setup.calibration)
 
 
@@ -107,6 +128,7 @@ def solve(ensemble: Ensemble, setup: Setup, active: Calibration | None = None) -
     The gate limits the change from ``active``, the calibration that this one would replace. Raises
     TooFewObservations when the ensemble is too small; the text names the shortage.
     """
+    setup = aligned_by(ensemble, setup)
     return calibration_of(estimated(ensemble, setup), ensemble, setup, active)
 
 
@@ -115,7 +137,8 @@ def judged(
     calibration: Calibration, ensemble: Ensemble, setup: Setup, active: Calibration | None
 ) -> Calibration:
     """A calibration of an ensemble with the checks and the verdict of the gate."""
-    checks = judge(calibration, setup.prior, active, setup.gate, setup.calibration)
+    prior = aligned_by(ensemble, setup).prior
+    checks = judge(calibration, prior, active, setup.gate, setup.calibration)
     reasons = reasons_of(checks)
     return dataclasses.replace(calibration, gate=checks, reasons=reasons, accepted=not reasons)
 

@@ -38,7 +38,7 @@ from starcal_ros.formats.messages.record_messages import (
     status_to_message,
 )
 from starcal_ros.options import from_mapping
-from starcal_ros.pipeline.setup import CalibratorOptions, load_stated_setup
+from starcal_ros.pipeline.setup import CalibratorOptions, check_site, load_setup
 from starcal_ros.records import IMAGE_REFUSALS
 from starcal_ros.ros import node
 from starcal_ros.ros.inputs import LATCHED
@@ -93,7 +93,8 @@ class Calibrator(node.StarcalNode):
         """Load the prior camera, options and state folder, create the latched publishers."""
         values = self.options.values()
         self._own = from_mapping(CalibratorOptions, values)
-        self._setup = load_stated_setup(values)
+        self._setup = load_setup(values)
+        check_site(self._setup.site)
         self._state.open(self._setup, self._own)
         self.get_logger().info(str(self._state))
         for text in (*self._state.damage, *self._state.withheld.values()):

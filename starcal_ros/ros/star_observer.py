@@ -23,7 +23,7 @@ from sensor_msgs.msg import Image as ImageMessage
 from starcal.msg import Calibration as CalibrationMessage
 from starcal.msg import StarObservations as ObservationsMessage
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
-from starcal_ros.errors import ImageRefused
+from starcal_ros.errors import ImageRefused, OptionError
 from starcal_ros.formats.messages import message_codec, record_messages, sensor_messages
 from starcal_ros.options import from_mapping
 from starcal_ros.pipeline import annotation, observe, setup
@@ -67,7 +67,13 @@ class StarObserver(StarcalNode):
         """Load the prior camera and the catalog, create the publishers."""
         values = self.options.values()
         self._own = from_mapping(setup.ObserverOptions, values)
-        self._setup = setup.load_stated_setup(values)
+        self._setup = setup.load_setup(values)
+        setup.check_site(self._setup.site)
+        if not self._setup.is_aligned:
+            raise OptionError(
+                'prior_alignment: not given: starcal calibrate BAG finds it from a recording,'
+                ' setup_finder beside the camera'
+            )
         self._geometry = self._setup.prior
         self._calibration_number = 0  # the calibration that predicts the stars; 0: the prior
         self._withdrawn = ''  # why the prior predicts the stars where a calibration did
