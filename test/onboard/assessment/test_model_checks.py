@@ -57,7 +57,8 @@ def test_a_sound_camera_contradicts_nothing_and_has_no_step() -> None:
         given = of_random_pointings(seed, images=6)
         checks = model_checks(estimated(given, true_observations(given)))
         assert {'cx', 'cy'} <= {term.name for term in checks.held}
-        assert all(term.significance < 4.5 for term in checks.held)
+        # NaN, of what the stars alone do not determine, is no contradiction.
+        assert not any(term.significance >= 4.5 for term in checks.held)
         assert all(one.likelihood_ratio < 20.0 for one in checks.amplitudes)
         assert checks.field_rms_px < 0.01 and checks.image_variation_px < 0.05
         assert checks.step.p_value > 1e-3
