@@ -298,7 +298,7 @@ def arrow(sums: StarSums, problem: Problem, state: State, layout: Layout) -> Nor
 
 
 def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats | float) -> Equations:
-    """Return the normal equations of `arrow` with the images eliminated."""
+    """Return the normal equations of a linearisation, the images eliminated."""
     normal = arrow(sums, linear.problem, linear.state, linear.layout)
     return without_images(normal, linear.layout, shape_sigma_px)
 
@@ -306,7 +306,11 @@ def equations(sums: StarSums, linear: Linearisation, shape_sigma_px: Floats | fl
 def without_images(
     normal: NormalEquations, layout: Layout, shape_sigma_px: Floats | float
 ) -> Equations:
-    """Return the same; ``shape_sigma_px`` (s,) is the prior of the shapes of the images."""
+    """
+    Return an arrow with the images eliminated, by the priors of their unknowns.
+
+    ``shape_sigma_px`` (s,) is that of their shapes.
+    """
     C = normal.C + np.diag(layout.image_precision(shape_sigma_px))
     return eliminated(dataclasses.replace(normal, C=C))
 

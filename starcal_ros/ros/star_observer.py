@@ -44,7 +44,9 @@ _SAMPLES = QoSProfile(depth=2000)
 _COMPARED = 8  # velocities with that of the Earth: 1 ms, once a second
 _STAMP_NS = operator.itemgetter(0)
 _DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
-_HISTORY_S = 3600.0  # attitudes of an hour take 2 MB at 10 Hz; only a recorder sends later images
+# Attitudes of an hour take 2 MB at 10 Hz, and up to two hours are held; only a recorder sends
+# later images.
+_HISTORY_S = 3600.0
 _KEPT = 5  # images that matched nothing: 50 MB of 5 megapixels and 16 bit
 _JUMP_S = 10.0  # smaller steps back are late messages, not a clock change
 
