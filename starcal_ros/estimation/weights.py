@@ -155,9 +155,12 @@ def tracker_attitudes(
         # Star trackers that are taken as exact have no misfits; their errors are as stated.
         for k in np.unique(problem.star_tracker):
             images = np.flatnonzero(problem.star_tracker == k)
-            group, working = np.zeros(len(images), np.int64), EXACT_RAD / stated[0]
-            exact = TrackerErrors(1.0, 0.0, np.eye(1), group, working, 0.0, '', 1.0)
-            trackers.append(dataclasses.replace(exact, sigma_rad=stated[0], images=images))
+            group = np.zeros(len(images), np.int64)
+            for size, axes in axes_by_sigma(stated):
+                exact = TrackerErrors(1.0, 0.0, np.eye(1), group, EXACT_RAD / size, 0.0, '', 1.0)
+                trackers.append(
+                    dataclasses.replace(exact, axes=axes, sigma_rad=size, images=images)
+                )
         return AttitudeErrors(error, covariance, seen, np.zeros(m, bool), tuple(trackers))
     is_stated = tracker_sigma_is_given(data.options)
     misfit = misfit_images(error / stated, variance, seen, problem.star_tracker, is_stated)
@@ -170,28 +173,29 @@ def tracker_attitudes(
         correlations = next(known, None) or correlations_of(
             data.time_ns[here], after.camera_from_icrf[here]
         )
-        for size in np.unique(stated):
+        for size, axes in axes_by_sigma(stated):
             # Noise about the boresight is that of few photons: slow errors are those of the
             # best axis, or as stated.
-            axes = np.flatnonzero(stated == size)
             tracker = tracker_errors(
-                error[np.ix_(here, axes)] / size,
-                variance[np.ix_(here, axes)],
+                error[here][:, list(axes)] / size,
+                variance[here][:, list(axes)],
                 correlations,
                 is_stated,
-                data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / float(size),
+                data.options.star_tracker_slow_arcsec * ARCSECOND_RAD / size,
                 float(stated.min() / size),
             )
             trackers.append(
                 dataclasses.replace(
-                    tracker,
-                    axes=tuple(axes.tolist()),
-                    sigma_rad=float(size),
-                    images=here,
-                    correlations=correlations,
+                    tracker, axes=axes, sigma_rad=size, images=here, correlations=correlations
                 )
             )
     return AttitudeErrors(error, covariance, seen, misfit, tuple(trackers))
+
+
+def axes_by_sigma(stated_rad: Floats) -> list[tuple[float, tuple[int, ...]]]:
+    """Return the stated sigmas of the axes (3,), each once, with the axes that have it."""
+    sizes = [float(size) for size in np.unique(stated_rad)]
+    return [(size, tuple(np.flatnonzero(stated_rad == size).tolist())) for size in sizes]
 
 
 def _rotations_of_stars(sums: StarSums, found: Posterior) -> tuple[Floats, Floats, Mask]:

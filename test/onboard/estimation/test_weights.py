@@ -21,7 +21,7 @@ from starcal_ros.estimation.posterior import Weighting
 from starcal_ros.estimation.shared_errors import observation_groups
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import Assumptions
-from starcal_ros.estimation.weights import Data, judge
+from starcal_ros.estimation.weights import axes_by_sigma, Data, judge
 from starcal_ros.records import CameraGeometry
 
 N = 6000
@@ -242,3 +242,7 @@ def test_residuals_that_no_star_is_left_of_say_so(off_px: float, words: str) -> 
     off = off_px * np.random.default_rng(1).normal(size=(n, 2))
     with pytest.raises(NotObservable, match=words):
         judge(data, off, np.full(n, 2.0), before, None)
+
+
+def test_axes_of_one_stated_sigma_are_taken_together() -> None:
+    assert axes_by_sigma(np.array([5.0, 20.0, 5.0])) == [(5.0, (0, 2)), (20.0, (1,))]
