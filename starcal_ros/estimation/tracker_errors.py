@@ -42,7 +42,7 @@ _NOISE_SIGMA = 0.5  # prior 1-sigma of ln n: data sheets are right to a factor o
 _WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
 _STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
-_MOST_MEMBERS = 4  # members of a group that give its mean correlation
+_MOST_MEMBERS = 4  # members of a group that give its mean correlation, spread over its time
 
 
 @dataclass(frozen=True)
@@ -229,10 +229,13 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     """
     group = groups_of(time_ns)
     size = np.bincount(group)
-    order = np.argsort(group, kind='stable')
-    some = order[np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size) < _MOST_MEMBERS]
     members = np.minimum(size, _MOST_MEMBERS)
     first = np.cumsum(members) - members
+    # Those of a group in equal steps of time order: neighbours are more alike than the others.
+    order = np.lexsort((time_ns, group))
+    place = np.arange(len(order)) - np.repeat(np.cumsum(size) - size, size)
+    share, of_size = np.repeat(members, size), np.repeat(size, size)
+    some = order[(place * share) // of_size > ((place - 1) * share) // of_size]
 
     def of_groups(K: Floats) -> Floats:
         """Return the mean correlation of the members of groups."""
@@ -459,7 +462,7 @@ def _drift(
     By the scatter about the slope: a drift raises the sigma of the star tracker that is estimated.
     """
     unknown = np.full(3, np.nan), math.nan, math.nan
-    used = here & attitudes.seen
+    used = here & attitudes.seen & ~attitudes.misfit
     freedom = np.count_nonzero(used) - 2  # beside a mean and a slope
     if freedom < 1:
         return unknown

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 import dataclasses
+import math
 from typing import Any
 
 import numpy as np
@@ -154,11 +155,21 @@ def test_without_images_of_the_first_its_alignment_has_the_sigma_of_the_mounting
     np.testing.assert_allclose(sigma_arcsec, 500.0, rtol=0.01)
 
 
-def test_a_star_tracker_that_drifts_is_named_and_loses_no_image() -> None:
-    """240 arcsec over the campaign, 48 sigma of one image: no image is a misfit."""
+@pytest.mark.parametrize('jump_deg', [0.0, 0.5])
+def test_a_star_tracker_that_drifts_is_named_and_loses_no_image(jump_deg: float) -> None:
+    """
+    240 arcsec over the campaign, 48 sigma of one image: no image is a misfit.
+
+    One attitude that jumps is, and hides no drift.
+    """
     given, ensemble = campaign(4, [0, 1, 2] * 12, np.array([240.0 / 36, 0.0, 0.0]))
-    found = estimated(given, ensemble)
-    assert found.termination == 'converged' and not found.misfit_image.any()
+    images = list(ensemble.images)
+    attitude = Rotation.from_quat(images[31].icrf_from_star_tracker_xyzw)
+    jumped = attitude * Rotation.from_rotvec([0.0, math.radians(jump_deg), 0.0])
+    images[31] = dataclasses.replace(images[31], icrf_from_star_tracker_xyzw=jumped.as_quat())
+    found = estimated(given, Ensemble(tuple(images)))
+    assert found.termination == 'converged'
+    assert np.flatnonzero(found.misfit_image).tolist() == [31] * bool(jump_deg)
     first, second, third = found.star_trackers
     for sound in (first, third):
         assert sound.drift_p_value > 1e-4

@@ -207,6 +207,18 @@ def test_groups_are_neighbours_in_time_in_any_order_of_the_images() -> None:
     group = module.groups_of(time_ns)
     assert np.array_equal(group, time_ns // 5)
     assert np.array_equal(module.groups_of(time_ns[:100]), np.arange(100))
+    attitudes = Rotation.random(403, random_state=np.random.default_rng(6))
+    order = np.argsort(time_ns)
+    found, sorted_ = (
+        correlations_of(one, of_one).kernels
+        for one, of_one in ((time_ns, attitudes), (time_ns[order], attitudes[order]))
+    )
+    np.testing.assert_allclose(found, sorted_, rtol=0, atol=1e-12)  # roundings of sums
+    # A group of five has the correlation of four over its whole time.
+    step = 1.0 / (0.3 * 402)
+    apart = np.abs(np.subtract.outer([0, 2, 3, 4], [0, 2, 3, 4]))
+    pairs = np.exp(-step * apart)[~np.eye(4, dtype=bool)]
+    assert found[0, 0, 0] == pytest.approx((1.0 + 4.0 * pairs.mean()) / 5.0, abs=1e-4)
 
 
 @pytest.mark.parametrize('stated_arcsec', [0.0, 5.0])
