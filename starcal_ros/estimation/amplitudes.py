@@ -44,9 +44,10 @@ OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0  # change of a camera from image to image
 LEAST_PX = 1e-9  # amplitude without any effect: no star is measured to a nanopixel
-# Where searches start: at the centre of the prior, and beyond, since the gradient vanishes near
-# zero and there may be several maxima.
-STARTS_PX = (1e-5, 1e-3, 1e-2, 1e-1, 1.0)
+# Where searches start: at the centre of the prior, since the gradient vanishes near zero, and in
+# steps of half a decade, the width of a maximum, from where stars begin to show an amplitude.
+# There may be several maxima.
+STARTS_PX = (1e-5, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1, 3e-1, 1.0)
 # Common factors of the amplitudes over which results are averaged, in logarithms: from one without
 # an effect to one that few images still allow.  Many images leave the factor 1 alone.
 _SHIFTS: Floats = np.asarray(np.linspace(-8.0, 6.0, 43), np.float64)
@@ -143,7 +144,7 @@ def field_amplitudes(
     count = int(octave.max()) + 1
     mean, precision = octave_prior(count, first)
     # The gradient vanishes near zero: a small amplitude and a large one.
-    starts_px = STARTS_PX[0], STARTS_PX[2]
+    starts_px = STARTS_PX[0], STARTS_PX[3]
     starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in starts_px]
     if near is not None:
         starts = [near.log_px, starts[-1]]
@@ -420,7 +421,7 @@ def _climb(
     next amplitudes are made with it, as far as ``at_once`` allows.  The posterior is flat where an
     amplitude has no effect, so that steps alone do not leave zero.
     """
-    coarse = np.log(STARTS_PX if near is None else STARTS_PX[1:4:2])
+    coarse = np.log(STARTS_PX if near is None else STARTS_PX[1:6])
     starts = np.tile(coarse[:, None], (1, count)) if near is None else near.log_px[None]
     values = likelihood(starts)
     best, value = starts[np.argmax(values)], float(values.max())
@@ -468,15 +469,21 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
     the images eliminated.
     """
     information = np.einsum('mii->mi', sums.information)
-    used = np.flatnonzero((information > 0).all(axis=1))[:MOST_CORRELATED]
+    place, time_s = np.arange(len(information)), sums.time_s
+    if len(time_s):
+        place[np.argsort(time_s, kind='stable')] = place.copy()
+    used = np.flatnonzero((information > 0).all(axis=1))
     if len(used) < 2:
         return np.zeros(len(sigma_px))
+    # Some of very many, over the whole campaign, stand for all.
+    used = used[np.argsort(place[used])]
+    used = used[np.linspace(0, len(used) - 1, min(len(used), MOST_CORRELATED)).astype(np.int64)]
     left = sums.gradient[used] - sums.cross[used] @ _shared_mean(sums, sigma_px)
     root = np.sqrt(information[used])
-    steps = np.abs(np.subtract.outer(used, used)).astype(np.float64)
-    if len(sums.time_s):
-        late_s = sums.time_s[used]
-        steps = np.maximum(steps, np.abs(np.subtract.outer(late_s, late_s)) / _STEP_S)
+    steps = np.abs(np.subtract.outer(place[used], place[used])).astype(np.float64)
+    if len(time_s):
+        apart_s = np.abs(np.subtract.outer(time_s[used], time_s[used]))
+        steps = np.maximum(steps, apart_s / _STEP_S)
     K = _PER_STEP**steps
     ratio = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
     common_px2 = np.empty(len(sigma_px))

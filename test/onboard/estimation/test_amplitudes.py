@@ -311,12 +311,22 @@ def test_the_common_part_follows_from_the_correlation_in_time(
     memory: float, spacing_s: float, step: float, low: float, high: float
 ) -> None:
     made = images(np.random.default_rng(9), (3.0, 0.5, 0.3), 30, 40, memory, common=0.0)
-    found = shapes(
-        dataclasses.replace(made.sums, time_s=np.asarray(spacing_s * np.arange(30.0), np.float64))
-    )
+    time_s = np.asarray(spacing_s * np.arange(30.0), np.float64)
+    found = shapes(dataclasses.replace(made.sums, time_s=time_s))
     expected = [common_px2(made, found.sigma_px, k, step) for k in range(3)]
     assert found.common_px2 == pytest.approx(expected, rel=1e-3)
     assert low <= found.common_px2[0] / found.sigma_px[0] ** 2 < high
+    order = np.random.default_rng(10).permutation(30)
+    mixed = Images(made.D[order], made.H[order], made.y[order])
+    again = shapes(dataclasses.replace(mixed.sums, time_s=time_s[order]))
+    assert again.common_px2 == pytest.approx(found.common_px2, rel=1e-6)
+
+
+def test_some_of_many_images_have_the_common_part_of_the_whole_campaign() -> None:
+    made = images(np.random.default_rng(11), (3.0, 0.5, 0.3), 250, 8, 0.9, common=0.0)
+    found = shapes(dataclasses.replace(made.sums, time_s=np.arange(250.0)))
+    # The mean correlation of 250 images is 0.07, that of their first hundred 0.17.
+    assert found.common_px2[0] / found.sigma_px[0] ** 2 == pytest.approx(0.078, abs=0.01)
 
 
 def test_images_without_stars_have_no_common_part() -> None:
