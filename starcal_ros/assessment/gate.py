@@ -140,7 +140,7 @@ def _unless_noise(check: GateCheck, is_noise: bool, statistic: str = '') -> Gate
 
 def _unless_chance(check: GateCheck, p_value: float, tests: int = 1) -> GateCheck:
     """Return one of some checks, which fails for a significant value alone."""
-    is_chance = not p_value < FALSE_ALARM_RATE / tests
+    is_chance = p_value >= FALSE_ALARM_RATE / tests and not math.isnan(check.found)
     return _unless_noise(check, is_chance, f'p-value {p_value_text(p_value)}')
 
 

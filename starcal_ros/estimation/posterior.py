@@ -379,10 +379,18 @@ class Weighting:
 
     @functools.cached_property
     def covariance_px2(self) -> Floats:
-        """Covariances (n, 3) of the observations: noise, and errors that a star alone has."""
+        """
+        Covariances (n, 3) of the observations: noise, and errors that a star alone has.
+
+        What a star has beyond others of its brightness adds to both axes.  What it lacks takes the
+        same share of both: a smear is narrower than the mean of its axes.
+        """
         covariance_px2 = self.variance.of(self.table.covariance_px2, self.table.magnitude)
         beyond_px2 = np.broadcast_to(star_shares_px2(self.errors)[1], len(self.table))
-        return np.asarray(covariance_px2 + np.outer(beyond_px2, [1.0, 0.0, 1.0]))
+        mean_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
+        share = 1.0 + np.minimum(beyond_px2, 0.0) / mean_px2
+        more_px2 = np.outer(np.maximum(beyond_px2, 0.0), [1.0, 0.0, 1.0])
+        return np.asarray(covariance_px2 * share[:, None] + more_px2)
 
     @functools.cached_property
     def variance_px2(self) -> Floats:
@@ -513,7 +521,8 @@ def _of_attitudes(
     sigma_rad = linear.problem.star_tracker_sigma_rad
     for tracker in trackers:
         group, images = tracker.group, tracker.images
-        to_working2 = (tracker.sigma_rad / sigma_rad[images[0], tracker.axes[0]]) ** 2
+        # An image that was a misfit a round ago has no weight: its working sigma is infinite.
+        to_working2 = (tracker.sigma_rad / sigma_rad[images, tracker.axes[0]].min()) ** 2
         shared = tracker.covariance - tracker.independent * np.eye(len(tracker.covariance))
         member = csr_array((np.ones(len(group)), (group, np.arange(len(group)))))
         for axis in tracker.axes:

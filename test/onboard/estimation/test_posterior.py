@@ -203,6 +203,23 @@ def test_shapes_have_the_likelihood_of_contrasts_free_of_everything_else(varied:
             assert log_likelihood(near_px) < log_likelihood(best_px) + 0.3
 
 
+def test_what_a_star_lacks_leaves_no_variance_of_a_smear_negative(given: Small) -> None:
+    smear_px2 = np.tile([0.01, 0.0, 0.81], (len(given.table), 1))
+    table = dataclasses.replace(given.table, covariance_px2=smear_px2)
+    from_sky, n = np.tile(np.eye(2), (len(table), 1, 1)), len(table)
+    lacks = SharedError('star places', table.star, np.full(n, 0.4), 9.0, True, 1.0, -0.3)
+    more = dataclasses.replace(lacks, beyond_px2=0.3)
+    less, greater = (
+        Weighting(table, from_sky, CentroidVariance(1.0, 0.0), (one,), given.keep, None)
+        for one in (lacks, more)
+    )
+    mean_px2 = smear_px2[:, [0, 2]].mean(axis=1)
+    for one, px2 in ((less, -0.3), (greater, 0.3)):
+        np.testing.assert_allclose(one.variance_px2, mean_px2 + px2, rtol=1e-12)
+        assert (one.covariance_px2[:, [0, 2]] > 0).all()
+    assert greater.covariance_px2[0] == pytest.approx([0.31, 0.0, 1.11])
+
+
 @dataclass(frozen=True)
 class Shared:
     """Errors that observations and attitudes share."""
