@@ -311,7 +311,7 @@ def provenance_of(setup: Setup, ensemble: Ensemble) -> dict[str, str]:
 
 def _digest(ensemble: Ensemble) -> str:
     """
-    SHA-256 of all input that an estimate reads from its images, in their order.
+    SHA-256 of stamps, attitudes, stars and temperatures of the images, in their order.
 
     For each image, little-endian: stamp (int64, ns), number of stars (int64), attitude, then by
     column catalog numbers (int64), directions, pixels and covariances, last the temperature if
