@@ -325,7 +325,8 @@ def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:
     noise = ', '.join(
         f'{significant(s / ARCSECOND_RAD, 3)}' for s in estimate.star_tracker_sigma_rad
     )
-    given = 'stated sigmas, ' if tracker_sigma_is_given(options) else ''
+    stated = ', '.join(significant(s, 3) for s in options.star_tracker_sigma_arcsec)
+    given = f'{stated}″ stated; ' * tracker_sigma_is_given(options)
     return f'{given}estimated: {noise}″ about x, y, z'
 
 
