@@ -305,7 +305,8 @@ def _of_errors(
 
 def _estimated(rms_px: float, likelihood_ratio: float) -> str:
     ratio = max(likelihood_ratio, 0.0)
-    return f'estimated: {significant(rms_px, 2)} px rms per axis, 2 log L {ratio:.1f}'
+    size = f'{significant(rms_px, 2)} px rms per axis'
+    return f'estimated, uncertainty included: {size}, 2 log L {ratio:.1f}'
 
 
 def _field_px(estimate: Estimate) -> float:
