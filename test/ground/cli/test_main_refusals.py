@@ -111,7 +111,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     'plan {bag} {params} --pointings north.csv': (
         "line 2: could not convert string to float: 'north'",),
     'plan {bag} {params} --pointings none.csv': ('no pointings',),
-    'plan {bag} {params} --pointings beyond.csv': ('not a direction',),
+    'plan {bag} {params} --pointings beyond.csv': ('--pointings: dec_deg is ',),
     'compare none': ('B',),
     'compare none none': ('none', 'No such file'),
     'compare {bag} {bag}': (str(TINY), 'no calibration.json'),
