@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 import math
 
@@ -10,13 +11,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtrc
 
-from starcal_ros.arrays import Floats
+from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment.lookup import GRID, grid_lines_of_sight, line_of_sight_table, movement
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
 from starcal_ros.record_fields import json_object
 from starcal_ros.records import Calibration, CameraGeometry
+from starcal_ros.text import counted
 
 _SINGULAR = 1e-12  # smaller eigenvalues of a correlation matrix are rounding errors
 
@@ -136,12 +138,14 @@ class Comparison:
         return _ratio(self.difference, self.sigma)
 
 
-def compare(a: Calibration, b: Calibration) -> Comparison:
+def compare(a: Calibration, b: Calibration, stamps_ns: Sequence[Indices] = ()) -> Comparison:
     """
     Difference of B from A.
 
-    Of two lens models only the lines of sight are compared.  Raises ProductError when the cameras
-    differ in size, or a pixel has no line of sight.
+    ``stamps_ns`` are the times of the images of A and of B (`Residuals.image_time_ns`), which show
+    whether both use the same images; without them the spans of their times have to.  Of two lens
+    models only the lines of sight are compared.  Raises ProductError when the cameras differ in
+    size, or a pixel has no line of sight.
 
     >>> import starcal_ground, starcal_ros
     >>> calibration = starcal_ros.read_calibration('out')
@@ -179,7 +183,7 @@ def compare(a: Calibration, b: Calibration) -> Comparison:
         before=_map(new - old, a.geometry, sight_sigma_rad),
         after=_map(new - rotation.apply(old), a.geometry, shape_sigma_rad),
         total=chi_squared(difference[compared], covariance[compared, compared]),
-        notes=_notes(a, b, difference, sigma),
+        notes=(*_shared(a, b, stamps_ns), *_notes(a, b, difference, sigma)),
     )
 
 
@@ -193,6 +197,7 @@ def truth_like(calibration: Calibration, geometry: CameraGeometry) -> Calibratio
         field=None,
         accepted=True,
         reasons=(),
+        images_used=0,
         provenance={},
     )
 
@@ -238,6 +243,21 @@ def _ratio(values: Floats, sigma: Floats) -> Floats:
     )
 
 
+def _shared(a: Calibration, b: Calibration, stamps_ns: Sequence[Indices]) -> list[str]:
+    """
+    Note that A and B use the same stars; empty if they do not.
+
+    Images of one camera are the same if their stamps are, whatever prior or options read them.
+    """
+    first_ns, last_ns = max(a.first_image_ns, b.first_image_ns), min(a.time_ns, b.time_ns)
+    count = len(np.intersect1d(stamps_ns[0], stamps_ns[1])) if len(stamps_ns) == 2 else None
+    if count == 0 or first_ns > last_ns or not (a.images_used and b.images_used):
+        return []
+    shared = f'share {counted(count, "image")}' if count else 'are of the same time'
+    correlated = 'errors by the same stars are correlated'
+    return [f'A and B {shared}: {correlated}, so the true sigma of a difference is smaller']
+
+
 def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) -> tuple[str, ...]:
     notes = []
     lens_a, lens_b = a.geometry.camera.model, b.geometry.camera.model
@@ -249,12 +269,6 @@ def _notes(a: Calibration, b: Calibration, difference: Floats, sigma: Floats) ->
     for name, calibration in (('A', a), ('B', b)):
         if not calibration.accepted:
             notes.append(f'the gate refused {name}: {"; ".join(calibration.reasons)}')
-    same = 'observations_sha256'
-    if a.provenance.get(same) and a.provenance.get(same) == b.provenance.get(same):
-        notes.append(
-            'A and B are from the same stars: their errors are correlated, so the true sigma of a '
-            'difference is smaller'
-        )
     held = [
         name
         for name, moved, error in zip(

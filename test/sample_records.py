@@ -170,8 +170,8 @@ def model_checks() -> ModelChecks:
         step=DetectorStep('u', 512.5, 'v', -0.015, 0.7),
         image_variation_px=0.03,
         amplitudes=(
-            Amplitude('field', 0.0125, 'px', 41.5),
-            Amplitude('change from image to image', 0.0003, 'px', 0.75),
+            Amplitude('field, most likely amplitude', 0.0125, 'px', 41.5),
+            Amplitude('change from image to image, most likely amplitude', 0.0003, 'px', 0.75),
         ),
         predictions=(
             ResidualBin('radius', 3.5, 320.25, 140, 1.02, 0.04),

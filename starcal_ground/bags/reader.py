@@ -349,11 +349,10 @@ class _Pieces:
                 at_end = isinstance(error, (EndOfFile, RecordLengthLimitExceeded))
                 kind = 'truncated' if at_end or stream.tell() >= size else 'damaged'
                 self.report(
-                    f'{kind} after byte {read_to} of {size} ({type(error).__name__});'
-                    ' all messages before it were read'
+                    f'{kind} after byte {read_to} of {size}; all messages before it were read'
                 )
             elif following is not None:
-                self.report(f'damaged after byte {read_to} of {size} ({type(error).__name__})')
+                self.report(f'damaged after byte {read_to} of {size}')
             return following
         return None
 
@@ -609,8 +608,17 @@ def choose_topic(paths: Iterable[Path | str], type_name: str, requested: str = '
                 f'{where}: an MCAP of ROS 1 messages: convert the bag that it was made from by'
                 ' rosbags-convert --src bag.bag --dst bag'
             )
+        if lost := damage_of(paths):
+            raise BagError(f'{lost}; no {type_name} is left: give the whole file')
         raise BagError(f'{where}: no topic of type {type_name} (topics: {listed})')
     raise BagError(f'{where}: several topics of type {type_name}: {listed}')
+
+
+def damage_of(paths: Iterable[Path | str]) -> str:
+    """Return the damage that reading the topics of bags reports; empty if there is none."""
+    damage: list[str] = []
+    topics(paths, damage.append)
+    return '; '.join(damage)
 
 
 def _is_of_ros_1(file: Path) -> bool:

@@ -151,7 +151,9 @@ def _choose(paths: Sequence[Path], type_name: str, requested: str, what: str) ->
         return reader.choose_topic(paths, type_name, requested)
     except BagError as error:
         several = any(topic.type_name == type_name for topic in reader.topics(paths))
-        remedy = f'choose one with --{what}-topic' if several else _WITHOUT.get(what, '')
+        # Messages that are lost with a part of the file were recorded.
+        missing = '' if reader.damage_of(paths) else _WITHOUT.get(what, '')
+        remedy = f'choose one with --{what}-topic' if several else missing
         raise BagError(f'{error}{remedy and "; "}{remedy}') from error
 
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import functools
 import math
 from pathlib import Path
+import re
 import textwrap
 
 import numpy as np
@@ -134,7 +135,9 @@ class Given:
         try:
             yield
         except OptionError as error:
-            if str(error).partition(':')[0] in self.settings:
+            # One option, an item of its list, or several: "name[2]: ...", "name, other: ...".
+            names = re.findall(r'\w+', str(error).partition(':')[0])
+            if not set(self.settings).isdisjoint(names):
                 raise OptionError(f'--set {error}') from error
             raise OptionError(f'{self.params}: {error}' if self.params else str(error)) from error
 

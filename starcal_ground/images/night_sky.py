@@ -188,7 +188,8 @@ def from_photographs(
     pixels_of = [*dict.fromkeys(one.pixels_of for one in photographs)]
     if flip:
         shown = 'that the rows of the files are last to first' if by_rows else 'a mirror image'
-        pixels_of.append(f'{MIRRORED[flip]}: the stars show {shown}')
+        count = f'{len(stars.icrf_from_camera)} of {stars.images} images'
+        pixels_of.append(f'{MIRRORED[flip]}: the stars of {count} show {shown}')
     notes = [
         *damaged.lines(),
         words_of_site,

@@ -150,9 +150,10 @@ def _is_image(path: Path) -> bool:
 
 
 class Refusals:
-    """Files that are left out, counted by their reason."""
+    """Files that are left out, or cannot be used, counted by their reason."""
 
-    def __init__(self) -> None:
+    def __init__(self, outcome: str = 'left out') -> None:
+        self._outcome = outcome
         self._names: dict[str, list[str]] = {}
 
     @contextlib.contextmanager
@@ -170,16 +171,15 @@ class Refusals:
     def lines(self) -> list[str]:
         """A line for each reason, with a few names."""
         by_count = sorted(self._names.items(), key=lambda item: -len(item[1]))
-        lines = [_left_out(names, reason) for reason, names in by_count[:_MOST_REASONS]]
+        lines = [self._line(names, reason) for reason, names in by_count[:_MOST_REASONS]]
         if others := [name for _, names in by_count[_MOST_REASONS:] for name in names]:
-            lines.append(_left_out(others, 'for other reasons'))
+            lines.append(self._line(others, 'for other reasons'))
         return lines
 
-
-def _left_out(names: Sequence[str], reason: str) -> str:
-    count = counted(len(names), 'file')
-    more = ', ...' if len(names) > _NAMES_SHOWN else ''
-    return f'left out: {count} ({", ".join(names[:_NAMES_SHOWN])}{more}): {reason}'
+    def _line(self, names: Sequence[str], reason: str) -> str:
+        count = counted(len(names), 'file')
+        more = ', ...' if len(names) > _NAMES_SHOWN else ''
+        return f'{self._outcome}: {count} ({", ".join(names[:_NAMES_SHOWN])}{more}): {reason}'
 
 
 def _readable(path: Path) -> FileKind:

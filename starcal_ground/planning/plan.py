@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 import dataclasses
+import itertools
 import math
 
 import numpy as np
@@ -341,14 +342,16 @@ class PlanRequest:
 
     def __post_init__(self) -> None:
         """Raise OptionError for numbers that have no meaning."""
-        places: tuple[Pointing | Cone, ...] = (*self.pointings, *self.avoid, self.within)
-        for place in places:
-            numbers = dataclasses.astuple(place)
-            if not all(map(math.isfinite, numbers)) or abs(place.dec_deg) > 90.0:
-                raise OptionError(f'{place}: not a direction in degrees')
-        for one in (*self.avoid, self.within):
-            if not 0.0 <= one.radius_deg <= 180.0:
-                raise OptionError(f'{one}: the radius is not within 0 to 180 deg')
+        limits = {'dec_deg': (-90.0, 90.0), 'radius_deg': (0.0, 180.0)}
+        given: dict[str, tuple[Pointing | Cone, ...]]
+        given = {'pointings': self.pointings, 'avoid': self.avoid, 'within': (self.within,)}
+        for option, places in given.items():
+            for name, value in itertools.chain(*(vars(place).items() for place in places)):
+                low, high = limits.get(name, (-360.0, 360.0))
+                if not low <= value <= high:  # NaN is within nothing
+                    raise OptionError(
+                        f'--{option}: {name} is {value:g}, not within {low:g} to {high:g}'
+                    )
 
 
 @dataclasses.dataclass(frozen=True)

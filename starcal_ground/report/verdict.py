@@ -147,7 +147,8 @@ def next_step(calibration: records.Calibration) -> str:
         steps = [f'{", ".join(of)}: {step}' for step, of in names.items() if step]
         return f'{"; ".join(["The sigmas hold, but miss a requirement", *steps])}.'
     return (
-        'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'
+        'Do not use it for navigation. Find the causes of the failed checks (starcal diagnose),'
+        ' mend them and calibrate again.'
     )
 
 

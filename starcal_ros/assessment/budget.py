@@ -305,7 +305,8 @@ def _of_errors(
 
 def _estimated(rms_px: float, likelihood_ratio: float) -> str:
     ratio = max(likelihood_ratio, 0.0)
-    return f'estimated: {significant(rms_px, 2)} px rms per axis, 2 log L {ratio:.1f}'
+    size = f'{significant(rms_px, 2)} px rms per axis'
+    return f'estimated, uncertainty included: {size}, 2 log L {ratio:.1f}'
 
 
 def _field_px(estimate: Estimate) -> float:
@@ -325,7 +326,8 @@ def _of_noise(estimate: Estimate, options: CalibrationOptions) -> str:
     noise = ', '.join(
         f'{significant(s / ARCSECOND_RAD, 3)}' for s in estimate.star_tracker_sigma_rad
     )
-    given = 'stated sigmas, ' if tracker_sigma_is_given(options) else ''
+    stated = ', '.join(significant(s, 3) for s in options.star_tracker_sigma_arcsec)
+    given = f'{stated}″ stated; ' * tracker_sigma_is_given(options)
     return f'{given}estimated: {noise}″ about x, y, z'
 
 

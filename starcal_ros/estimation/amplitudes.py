@@ -28,7 +28,7 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from scipy.optimize import brentq
 from scipy.special import erf, expit
 
-from starcal_ros.arrays import Floats, Indices
+from starcal_ros.arrays import Floats, Indices, Mask
 from starcal_ros.estimation.levenberg_marquardt import NotObservable
 from starcal_ros.estimation.limits import (
     LEAST_GAIN,
@@ -43,6 +43,7 @@ OCTAVE_STEP, OCTAVE_SIGMA = -0.7, 1.0
 # Beyond it field and camera are collinear, and the likelihood is rounding.
 LARGEST_FIELD_PX = 0.5
 LARGEST_SHAPE_PX = 30.0  # change of a camera from image to image
+_WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
 LEAST_PX = 1e-9  # amplitude without any effect: no star is measured to a nanopixel
 # Where searches start: at the centre of the prior, since the gradient vanishes near zero, and in
 # steps of half a decade, the width of a maximum, from where stars begin to show an amplitude.
@@ -69,6 +70,18 @@ class LogPrior:
     def log_density(self, log_amplitude: NDArray[np.floating]) -> Floats:
         """Return the log density (...) at logarithms (...), up to a constant."""
         return np.asarray(-0.5 * ((log_amplitude - self.centre) / self.sigma) ** 2)
+
+    def log_density_if_wrong(self, log_amplitude: NDArray[np.floating]) -> Floats:
+        """Return the same if the centre is of a wrong data sheet, which states nothing."""
+        unstated = LogPrior(self.centre)
+        odds = _WRONG_SHEETS / (1.0 - _WRONG_SHEETS)
+        scale = math.log(odds * self.sigma / unstated.sigma)
+        return np.asarray(unstated.log_density(log_amplitude) + scale)
+
+    def is_wrong(self, log_amplitude: NDArray[np.floating]) -> Mask:
+        """True where an amplitude is likelier by a wrong data sheet."""
+        right = self.log_density(log_amplitude)
+        return np.asarray(self.log_density_if_wrong(log_amplitude) > right)
 
 
 def log_amplitudes(largest_px: float) -> Floats:

@@ -98,7 +98,7 @@ _LEAST_SHARE = 0.25  # smaller steps would not arrive within `MOST_ROUNDS`
 _SPACE_VELOCITY_M_S = 20000.0  # against the Earth, usual in orbits about the Earth and the Sun
 _PLAUSIBLE_M_S = 8000.0  # orbits about the Earth are no faster
 _UNKNOWN_READOUT_S = 0.02  # a rolling shutter takes 5 to 50 ms a frame
-_LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states it on the ground; flight changes it
+LENS_RESIDUAL_LOG_SIGMA = 1.5  # a data sheet states it on the ground; flight changes it
 _READOUT_ERROR = 0.01  # a data sheet rounds the time, and clocks have a tolerance
 
 
@@ -324,7 +324,7 @@ def _assumed(ensemble: Ensemble, options: CalibrationOptions) -> Assumptions:
     readout = readout_s[options.shutter]
     lens, refraction = LogPrior(), None
     if options.lens_residual_px:
-        lens = LogPrior(math.log(options.lens_residual_px), _LENS_RESIDUAL_LOG_SIGMA)
+        lens = LogPrior(math.log(options.lens_residual_px), LENS_RESIDUAL_LOG_SIGMA)
     zenith = np.array([image.zenith_icrf for image in ensemble.images])
     is_known = np.isfinite(zenith).all(axis=1)
     if is_known.any():  # where none is stated, as in older recordings, the air turns no star

@@ -38,10 +38,9 @@ _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a lar
 _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
 _LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma; more where errors are larger
 _BEYOND = 1.0  # the grid ends a factor of e above the RMS of the errors at least
-_NOISE_SIGMA = 0.5  # prior 1-sigma of ln n: data sheets are right to a factor of 1.6
-_WRONG_SHEETS = 0.02  # prior probability that a data sheet states no more than none does
+STATED_NOISE = LogPrior(0.0, 0.5)  # of n in the stated sigma: data sheets are right to 1.6
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
-_STATED_SLOW_SIGMA = 0.3  # the same about a stated star_tracker_slow_arcsec: within 35 %
+STATED_SLOW = LogPrior(0.0, 0.3)  # of s in a stated star_tracker_slow_arcsec: within 35 %
 _MOST_MEMBERS = 4  # members of a group that give its mean correlation, spread over its time
 
 
@@ -134,14 +133,14 @@ def tracker_errors(
     """
     (m, count), group = error.shape, correlations.group
     size = np.bincount(group)
-    slow_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
+    slow_prior = STATED_SLOW if stated_slow else LogPrior(0.0, _SLOW_SIGMA)
     of_stars = float(np.median(variance))
     log_noise, centre, noise_prior = _noise_grid(error, is_stated)
     if stated_slow:
         centre = np.zeros(len(centre))
     centre = centre + math.log(stated_slow or usual_slow)
     slow2, noise2 = np.exp(2.0 * (centre + _LOG_SLOW[:, None])), np.exp(2.0 * log_noise)
-    prior = noise_prior + LogPrior(0.0, slow_sigma).log_density(_LOG_SLOW[:, None])
+    prior = noise_prior + slow_prior.log_density(_LOG_SLOW[:, None])
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
     within = float(((error - of_group[group]) ** 2).sum())
     log_weight, mean_information = [], []
@@ -192,13 +191,11 @@ def _noise_grid(error: Floats, is_stated: bool) -> tuple[Floats, Floats, Floats]
     log_rms = 0.5 * math.log(max(float((error**2).mean()), 1e-300))
     more = max(math.ceil((log_rms + _BEYOND - _LOG_NOISE[-1]) / step), 0)
     log_noise: Floats = np.append(_LOG_NOISE, _LOG_NOISE[-1] + step * np.arange(1, more + 1))
-    unstated, stated = LogPrior(0.0), LogPrior(0.0, _NOISE_SIGMA)
-    wrong, right = unstated.log_density(log_noise), stated.log_density(log_noise)
     if not is_stated:
-        return log_noise, log_noise, wrong
-    odds = _WRONG_SHEETS / (1.0 - _WRONG_SHEETS)
-    wrong = wrong + math.log(odds * stated.sigma / unstated.sigma)
-    return log_noise, np.where(wrong > right, log_noise, 0.0), np.logaddexp(right, wrong)
+        return log_noise, log_noise, LogPrior(0.0).log_density(log_noise)
+    right = STATED_NOISE.log_density(log_noise)
+    prior = np.logaddexp(right, STATED_NOISE.log_density_if_wrong(log_noise))
+    return log_noise, np.where(STATED_NOISE.is_wrong(log_noise), log_noise, 0.0), prior
 
 
 def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise: float) -> float:
@@ -207,7 +204,7 @@ def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise:
 
     It uses the prior means of s and K, since there is no scatter before a solve.
     """
-    log_sigma = _STATED_SLOW_SIGMA if stated_slow else _SLOW_SIGMA
+    log_sigma = STATED_SLOW.sigma if stated_slow else _SLOW_SIGMA
     size = np.bincount(correlations.group) / len(correlations.group)
     shared = float((size @ correlations.kernels @ size).mean())
     return (stated_slow or noise) * math.exp(0.5 * log_sigma**2) * math.sqrt(shared)

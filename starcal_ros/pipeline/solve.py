@@ -21,7 +21,7 @@ from starcal_ros.assessment import observability
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
 from starcal_ros.assessment.model_checks import model_checks
-from starcal_ros.assessment.stated import check_statements, with_doubts
+from starcal_ros.assessment.stated import check_sigmas, check_statements, with_doubts
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert
@@ -212,7 +212,11 @@ def calibration_of(
             for tracker in result.star_trackers
         ),
         model_checks=model_checks(
-            result, check_statements(ensemble, setup.calibration, setup.catalog)
+            result,
+            (
+                *check_statements(ensemble, setup.calibration, setup.catalog),
+                *check_sigmas(result, setup.calibration),
+            ),
         ),
         field=factored_field(field, result.map_covariance) if field else None,
         sigma_budget=budget,

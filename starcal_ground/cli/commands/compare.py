@@ -37,12 +37,21 @@ def add_arguments(command: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     from starcal_ground import comparison
+    from starcal_ground.products import read_residuals, RESIDUALS_FILE
     from starcal_ground.simulation.simulated_bag import read_truth
-    from starcal_ros.formats.products.product_files import calibration_file, read_calibration
+    from starcal_ros.formats.products.product_files import (
+        CALIBRATION_FILE,
+        calibration_file,
+        read_calibration,
+    )
 
     of_a, of_b = (calibration_file(path) for path in (args.a, args.b))
     a = read_calibration(of_a)
-    result = comparison.compare(a, read_truth(of_b, a) or read_calibration(of_b))
+    b = read_truth(of_b, a) or read_calibration(of_b)
+    products = (path for path in (of_a, of_b) if path.name == CALIBRATION_FILE)
+    beside = (path.with_name(RESIDUALS_FILE) for path in products)
+    stamps_ns = [read_residuals(path).image_time_ns for path in beside if path.is_file()]
+    result = comparison.compare(a, b, stamps_ns)
     if args.json:
         arguments.print_json(comparison.content(result))
     else:

@@ -87,11 +87,7 @@ def run(args: argparse.Namespace) -> int:
     times = arguments.file_facts(args).times
     options = dataclasses.replace(arguments.record_of(ImageOptions, args), times=times)
     with mission_records.Guard() as guard, progress_bar(2 * len(paths), 'images') as advance:
-        files, problems = recording.look_at_all(paths, options, guard, advance)
-        for problem in problems:
-            arguments.complain(problem)
-        if problems:
-            return arguments.EXIT_BAD_INPUT
+        files = recording.look_at_all(paths, options, guard, advance)
         stamps = [file.time_ns for file in files]
         attitudes, *others = (
             guard.call(_names(args.attitude), sources.attitudes, args.attitude, frame, stamps)

@@ -20,6 +20,7 @@ from starcal_ground import products, written_files
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags.reader import IMAGE_FILE
 from starcal_ground.images import image_series
+from starcal_ground.images.photographs import Refusals
 from starcal_ground.mission.ingest.mission_records import Attitudes, Guard, Velocities
 from starcal_ground.products import input_name
 from starcal_ros.constants import NANOSECONDS_PER_SECOND, utc_text
@@ -70,22 +71,22 @@ def look_at_all(
     options: image_series.ImageOptions,
     guard: Guard,
     on_image: Callable[[], None] = lambda: None,
-) -> tuple[list[image_series.ImageFile], list[str]]:
+) -> list[image_series.ImageFile]:
     """
-    The image files in order of time, and one line for each file that cannot be taken.
+    The image files in order of time.
 
-    Raises IngestError when the images have different sizes, or two have one time.
+    Raises IngestError with the files that cannot be used, by their reasons, or when the images
+    have different sizes, or two have one time.
     """
-    files, problems = [], []
+    files, refusals = [], Refusals('cannot be used')
     for path in paths:
-        try:
+        with refusals.of(path):
             files.append(guard.call(path, image_series.look, path, _options_of(path, options)))
-        except IngestError as error:
-            problems.append(str(error))
         on_image()
-    if files:
-        image_series.check_alike(files)
-    return sorted(files, key=lambda file: file.time_ns), problems
+    if lines := refusals.lines():
+        raise IngestError('; '.join(lines))
+    image_series.check_alike(files)
+    return sorted(files, key=lambda file: file.time_ns)
 
 
 def _options_of(path: Path, options: image_series.ImageOptions) -> image_series.ImageOptions:

@@ -118,6 +118,13 @@ def test_attitudes_that_are_not_chosen_are_named(tmp_path, kinds, asked, said) -
             topics.choose_topics(bags, Topics(attitude=asked), setup)
 
 
+def test_a_bag_cut_off_in_its_only_chunk_is_asked_for_whole(tmp_path) -> None:
+    (cut := tmp_path / 'cut.mcap').write_bytes((TINY / 'tiny_0.mcap').read_bytes()[:900_000])
+    said = 'truncated after byte 36 of 900000; .*; no sensor_msgs/msg/Image is left: give'
+    with pytest.raises(BagError, match=f'^{cut}: {said} the whole file$'):
+        topics.choose_topics([cut], Topics())
+
+
 @pytest.mark.parametrize(
     ('kind', 'is_named'),
     [

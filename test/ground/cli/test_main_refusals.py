@@ -66,6 +66,9 @@ WRONG: dict[str, tuple[str, ...]] = {
         'params.yaml: a parameter file, not a camera file: give it as --params',),
     'calibrate {bag} -o new --set observer=grond': ('--set observer', 'did you mean ground?'),
     'calibrate {bag} -o new --set obsrver=ground': ('--set obsrver', 'did you mean observer?'),
+    'calibrate {bag} {params} -o new --set star_tracker_sigma_arcsec=[1,-5,1]': (
+        ': --set star_tracker_sigma_arcsec[1]: -5',),
+    'calibrate {bag} {params} -o new --set latitude_deg=10': (': --set latitude_deg, lo',),
     'calibrate {bag} -o new --set observer': ('--set', 'not of the form NAME=VALUE'),
     'calibrate {bag} -o new --observer ground': (
         'did you mean --set observer=VALUE?', 'starcal calibrate --help'),
@@ -108,7 +111,7 @@ WRONG: dict[str, tuple[str, ...]] = {
     'plan {bag} {params} --pointings north.csv': (
         "line 2: could not convert string to float: 'north'",),
     'plan {bag} {params} --pointings none.csv': ('no pointings',),
-    'plan {bag} {params} --pointings beyond.csv': ('not a direction',),
+    'plan {bag} {params} --pointings beyond.csv': ('--pointings: dec_deg is ',),
     'compare none': ('B',),
     'compare none none': ('none', 'No such file'),
     'compare {bag} {bag}': (str(TINY), 'no calibration.json'),

@@ -134,8 +134,8 @@ def test_stated_times_and_a_stated_flip_are_those_of_the_calibration(tmp_path, s
 @pytest.mark.parametrize(
     ('kind', 'words'),
     [
-        ('rows of unknown order', 'mirrored top to bottom: the stars show that the rows'),
-        ('mirrored PNG', 'mirrored left to right'),
+        ('rows of unknown order', 'mirrored top to bottom: the stars of 4 of 4 images show that'),
+        ('mirrored PNG', 'mirrored left to right: the stars of 4 of 4 images show a mirror'),
     ],
 )
 def test_the_axis_of_a_mirror_image_is_that_of_the_file_and_is_in_the_products(

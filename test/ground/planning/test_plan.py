@@ -138,8 +138,8 @@ def test_a_plan_says_when_more_images_stop_helping(setup, ensemble) -> None:
 @pytest.mark.parametrize(
     ('changed', 'text'),
     [
-        ({'avoid': (Cone(math.nan, 0.0, 5.0),)}, 'not a direction'),
-        ({'within': Cone(0.0, 0.0, 200.0)}, 'the radius is not within'),
+        ({'avoid': (Cone(math.nan, 0.0, 5.0),)}, '--avoid: ra_deg is nan, not within'),
+        ({'within': Cone(0.0, 0.0, 200.0)}, '--within: radius_deg is 200, not within 0 to 180'),
     ],
 )
 def test_a_request_without_a_meaning(changed, text) -> None:

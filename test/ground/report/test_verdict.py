@@ -61,7 +61,10 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products) -> None:
     )
 
 
-MEND = 'Do not use it for navigation. Mend the causes of the failed checks and calibrate again.'
+MEND = (
+    'Do not use it for navigation. Find the causes of the failed checks (starcal diagnose), mend'
+    ' them and calibrate again.'
+)
 
 
 @pytest.mark.parametrize(

@@ -127,6 +127,8 @@ def test_a_slow_error_is_the_fall_of_an_estimate_that_has_none() -> None:
     _, of_pointing = fall(parts(World())['total'], stated['total'])
     assert part.pointing_arcsec == pytest.approx(of_pointing, rel=0.05)
     assert part.assumption.startswith('not given: as the noise assumed; estimated: ')
+    assert parts(World())['field'].assumption.startswith('estimated, uncertainty included: ')
+    assert parts(World())['star tracker noise'].assumption.startswith('20, 20, 20″ stated; ')
 
 
 @pytest.mark.parametrize(

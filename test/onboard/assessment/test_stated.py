@@ -12,17 +12,18 @@ import numpy as np
 import pytest
 from sample_records import model_checks  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
-from worlds import estimated, honesty, of_random_pointings  # type: ignore[import-not-found]
+from worlds import campaign, estimated, honesty, of_random_pointings, options_of, solved  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions, model_gate, reasons_of
-from starcal_ros.assessment.stated import check_statements, with_doubts
+from starcal_ros.assessment.stated import check_sigmas, check_statements, with_doubts
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, HeldTerm, StarObservations, StatementCheck
 from starcal_ros.sky.astrometry import apparent_directions, earth_velocity_c
 from starcal_ros.sky.catalog import load_catalog
+from studies.worlds import World
 
 CATALOG = load_catalog(None, 8.0)
 GIVEN = of_random_pointings(9)
@@ -154,6 +155,23 @@ def test_a_statement_is_confirmed_contradicted_or_listed_as_not_checked(
     gate = tuple(model_gate(dataclasses.replace(checks, statements=(check,)), GateOptions()))
     assert (gate[0].name, gate[0].passed) == (f'{name} as stated', passed)
     assert (check.note in reasons_of(gate)) == (passed is False)
+
+
+@pytest.mark.parametrize(
+    ('stated', 'named'),
+    [
+        ({}, ''),  # 20 arcsec, as it is
+        ({'star_tracker_sigma_arcsec': (5.0, 5.0, 5.0)}, ''),
+        ({'star_tracker_sigma_arcsec': (0.1, 0.1, 0.1)}, '0.1″ stated, 16.6″'),
+        ({'star_tracker_slow_arcsec': 1000.0}, '1000″ stated, '),
+        ({'lens_residual_px': 0.5}, '0.5 px stated, 0.00'),
+        ({'star_tracker_sigma_arcsec': (0.1, 0.1, 0.1), 'method': 'single'}, ''),  # exact
+    ],
+)
+def test_a_stated_sigma_is_named_where_the_images_contradict_it(stated, named) -> None:
+    options = options_of(campaign(World(), 1).scenario, **stated)
+    notes = [one.note for one in check_sigmas(solved(World(), 1, **stated), options)]
+    assert [note.startswith(named) for note in notes] == [True] * bool(named), notes
 
 
 @pytest.mark.parametrize('sigma_m_s', [math.nan, 0.0, 2e4])
