@@ -30,12 +30,15 @@ class CentroidVariance:
     The scale corrects a wrong detector gain.  The factor f covers errors that come with
     brightness, as of saturated cores: linear between ``class_magnitude`` (k,), ascending, with the
     values ``class_factor`` (k,), and constant outside; 1 where both are empty.
+
+    ``floor_sigma_px2``: 1-sigma of the floor, with the scale unknown.
     """
 
     scale: float
     floor_px2: float
     class_magnitude: tuple[float, ...] = ()
     class_factor: tuple[float, ...] = ()
+    floor_sigma_px2: float = math.inf
 
     def of(self, covariance_px2: Floats, magnitude: NDArray[np.floating]) -> Floats:
         """Corrected covariances (n, 3) uu, uv, vv of stars of magnitudes (n,)."""
@@ -84,14 +87,14 @@ def estimate_variance(
     for _ in range(MOST_ROUNDS):
         expected = scale * own + floor_px2
         weight = 0.5 * left * _part(squared / expected, outlier_sigma) / expected**2
-        scale, floor_px2 = _line(own, squared, weight)
+        scale, floor_px2, floor_sigma_px2 = _line(own, squared, weight)
         step = scale * own + floor_px2 - expected
         if weight @ step**2 < STEP_SIGMA**2:
             break
     ratio = squared / (scale * own + floor_px2)
     counted = 0.5 * left * _part(ratio, outlier_sigma)
     nodes, factors = _brightness(ratio, counted, np.asarray(magnitude, np.float64)[used])
-    return CentroidVariance(scale, floor_px2, nodes, factors)
+    return CentroidVariance(scale, floor_px2, nodes, factors, floor_sigma_px2)
 
 
 def _part(ratio: Floats, outlier_sigma: float) -> Floats:
@@ -104,22 +107,28 @@ def _part(ratio: Floats, outlier_sigma: float) -> Floats:
     return np.asarray(np.clip(3.5 - 3.0 * ratio / (0.5 * outlier_sigma**2), 0.0, 1.0))
 
 
-def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float]:
-    """Return scale and floor of ``squared = scale own + floor``, not negative."""
+def _line(own: Floats, squared: Floats, weight: Floats) -> tuple[float, float, float]:
+    """
+    Return scale and floor of ``squared = scale own + floor``, not negative, and the floor's sigma.
+
+    The weights are inverse variances.
+    """
     weighted = weight * own
     by_own, both, by_one = float(weighted @ own), float(weighted.sum()), float(weight.sum())
     right_own, right_one = float(weighted @ squared), float(weight @ squared)
     determinant = by_own * by_one - both**2
     scale, floor_px2 = right_own / by_own, 0.0
+    sigma_px2 = math.inf
     if determinant > ROUNDING * by_own * by_one:  # not all variances are equal
         scale = (by_one * right_own - both * right_one) / determinant
         floor_px2 = (by_own * right_one - both * right_own) / determinant
+        sigma_px2 = math.sqrt(by_own / determinant)
     if floor_px2 < 0:
         scale, floor_px2 = right_own / by_own, 0.0
     if not _SCALE_LIMITS[0] <= scale <= _SCALE_LIMITS[1]:
         scale = float(np.clip(scale, *_SCALE_LIMITS))
         floor_px2 = max((right_one - scale * both) / by_one, 0.0)
-    return scale, floor_px2
+    return scale, floor_px2, sigma_px2
 
 
 def _brightness(

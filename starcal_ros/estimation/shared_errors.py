@@ -29,6 +29,7 @@ from itertools import pairwise
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from starcal_ros.arrays import Floats, Indices, Mask
@@ -47,6 +48,7 @@ from starcal_ros.estimation.unknowns import FIELD_OCTAVES
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
 _TAIL = 2.0  # degrees of freedom of the errors of stars
+_GAUSSIAN_ENDS = 5.0  # sigma, beyond which a normal likelihood is below 1e-5
 _LOG_GRID = log_amplitudes(LARGEST_FIELD_PX)
 _PRIOR: Floats = np.exp(LogPrior().log_density(_LOG_GRID))
 
@@ -160,6 +162,7 @@ def shared_errors(
     groups: Sequence[Groups],
     from_sky: Floats,
     last_octave: tuple[Floats, Floats],
+    floor_px2: tuple[float, float],
 ) -> tuple[SharedError, ...]:
     """
     Return the errors that observations share.
@@ -176,6 +179,8 @@ def shared_errors(
         Rotation of a displacement fixed to the star into pixel axes.
     last_octave : (s,), (s,)
         Posterior of the logarithm of the finest amplitude of the field, with weights.
+    floor_px2 : (estimate, 1-sigma)
+        Variance per axis that all centroids have beyond their own.
     """
     star = groups[0].group
     sightings = np.maximum(np.bincount(star, used)[star], 1.0)
@@ -198,7 +203,9 @@ def shared_errors(
     together = max(_pairs(working * np.sqrt(groups[0].together), star), 0.0)
     share = together / max(_pairs(working, star), together, 1e-300)
     first = last_octave[1] @ _next_octave(last_octave[0]) * _beside_stars(of_places, share)
-    variances = chain_means(first, _increments(moments))
+    # The errors of stars are a part of the floor too.
+    excess_px2 = max(floor_px2[0] - float(usual_px2[used].mean()), 0.0)
+    variances = chain_means(first, _increments(moments), (excess_px2, floor_px2[1]))
     for kind, moment, variance in zip(groups[1:], moments, variances, strict=True):
         ratio = max(moment[0] / moment[1], 0.0) ** 2
         found.append(_error(kind, weight, np.full(len(weight), variance), ratio, 0.0))
@@ -356,7 +363,11 @@ def _transition() -> Floats:
     return _next_octave(_LOG_GRID)
 
 
-def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[float]:
+def chain_means(
+    first: Floats,
+    moments: Sequence[tuple[float, float]],
+    excess_px2: tuple[float, float] = (0.0, math.inf),
+) -> list[float]:
     """
     Return the posterior mean variance, px^2, of errors in a chain, the first with its prior.
 
@@ -369,24 +380,60 @@ def chain_means(first: Floats, moments: Sequence[tuple[float, float]]) -> list[f
         Prior weights of the first on the grid.
     moments : sequence of (estimate, 1-sigma), px^2
         From `pair_moment`.
+    excess_px2 : (estimate, 1-sigma)
+        Of the variance of centroids, not negative: noise, or these errors.
     """
+    x = np.exp(2.0 * _LOG_GRID)
+    log_likelihoods = [-0.5 * ((estimate - x) / sigma) ** 2 for estimate, sigma in moments]
+    # The likelihood of the sum of the errors as a Fourier series: each term is a product.
+    waves, of_noise, most_px2 = _excess_waves(*excess_px2, len(moments))
+    turned = np.exp(-1j * np.outer(x, waves)) * (x <= most_px2)[:, None]
+    likelihoods = [np.exp(one - one.max())[:, None] * turned for one in log_likelihoods]
     transition = _transition()
-    forward = first
-    likelihoods, before = [], []
-    for estimate, sigma in moments:
-        off = -0.5 * ((estimate - np.exp(2.0 * _LOG_GRID)) / sigma) ** 2
-        likelihoods.append(np.exp(off - off.max()))
-        before.append(forward)
-        forward = forward * likelihoods[-1]
-        forward = (forward / forward.sum()) @ transition
-    after = np.ones(len(_LOG_GRID))
+    before = [first[:, None] * of_noise]
+    for one in likelihoods[:-1]:
+        before.append(_product(transition.T, before[-1] * one))
+    after = np.ones_like(turned)
     means = []
     for likelihood, prior in zip(reversed(likelihoods), reversed(before), strict=True):
-        weight = prior * likelihood * after
-        means.append(float(weight @ np.exp(2.0 * _LOG_GRID) / weight.sum()))
-        after = transition @ (likelihood * after)
-        after /= after.max()
+        weight = (prior * likelihood * after).real.sum(axis=1)
+        means.append(float(weight @ x / weight.sum()))
+        after = _product(transition, likelihood * after)
     return means[::-1]
+
+
+def _product(matrix: Floats, columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Return the product of a real matrix and complex columns, in half of the time."""
+    return np.asarray((matrix @ columns.view(np.float64)).view(np.complex128))
+
+
+def _excess_waves(
+    excess_px2: float, sigma_px2: float, count: int
+) -> tuple[Floats, NDArray[np.complexfloating], float]:
+    """
+    Return frequencies (w,), factors (w,) and the largest error of a likelihood of errors.
+
+    It is that of their sum by an excess of the variance of centroids.  The excess is that sum and
+    noise that each centroid has alone, which has the same prior as an error: where no two stars
+    are near each other, nothing else tells one from the other.
+    """
+    if not math.isfinite(sigma_px2):
+        return np.zeros(1), np.ones(1, np.complex128), math.inf
+    # The grids are no finer than this.
+    sigma_px2 = math.hypot(sigma_px2, 2.0 * (_LOG_GRID[1] - _LOG_GRID[0]) * excess_px2)
+    most_px2 = excess_px2 + _GAUSSIAN_ENDS * sigma_px2
+    log_noise = _LOG_GRID
+    if most_px2 > LARGEST_FIELD_PX**2:
+        log_noise = log_amplitudes(math.sqrt(most_px2))
+    noise_px2 = np.exp(2.0 * log_noise)
+    prior = np.exp(LogPrior().log_density(log_noise)) * (noise_px2 <= most_px2)
+    # The series repeats beyond the largest sum.
+    period_px2 = (count + 1) * most_px2
+    step = 2.0 * math.pi / period_px2
+    waves = np.arange(0.0, _GAUSSIAN_ENDS / sigma_px2 + step, step, np.float64)
+    turned = np.exp(1j * np.outer(waves, excess_px2 - noise_px2))
+    size = np.exp(-0.5 * (waves * sigma_px2) ** 2) * np.where(waves > 0, 2.0, 1.0)
+    return waves, size * (turned @ prior), most_px2
 
 
 def pixel_variance_px2(errors: Sequence[SharedError]) -> float:

@@ -266,6 +266,12 @@ def judge(
     if found is not None:
         own_px2 = 0.5 * (covariance_px2[:, 0] + covariance_px2[:, 2])
         errors = shared_errors(
-            residual_px, own_px2, kept, data.groups, before.from_sky, found.last_octave
+            residual_px,
+            own_px2,
+            kept,
+            data.groups,
+            before.from_sky,
+            found.last_octave,
+            (variance.floor_px2, variance.floor_sigma_px2),
         )
     return Weighting(table, before.from_sky, variance, errors, kept, attitudes)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 import pytest
 from scipy.integrate import quad
+from scipy.stats import norm
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.estimation.amplitudes import LARGEST_FIELD_PX, log_amplitudes
@@ -87,9 +88,25 @@ def test_a_posterior_mean_is_the_integral_over_the_prior(estimate: float, sigma:
     assert posterior_mean(estimate, sigma) == pytest.approx(above / below, rel=0.08)
 
 
-def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes() -> None:
+FEW_PAIRS = [(1e-4, 3e-4), (2e-4, 3e-4), (0.0, 3e-4)]
+
+
+@pytest.mark.parametrize(
+    ('moments', 'excess', 'near', 'least'),
+    [
+        ([(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)], (0.0, math.inf), 1e-9, 2.8e-4),
+        (FEW_PAIRS, (0.0, math.inf), 1e-9, 1e-6),
+        # The excess is noise or structure; its sigma is that of the grid at least, 17 %.
+        (FEW_PAIRS, (8e-4, 4e-4), 0.08, 5e-5),
+        (FEW_PAIRS, (0.0, 2e-4), 0.08, 1e-6),
+        ([(4e-3, 1e-3), (0.0, 1e-3), (0.0, 1e-3)], (1e-3, 5e-4), 0.08, 5e-4),
+        ([(0.0, math.inf)] * 3, (1e-3, 5e-4), 0.08, 1e-4),
+    ],
+)
+def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
+    moments: list[tuple[float, float]], excess: tuple[float, float], near: float, least: float
+) -> None:
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
-    moments = [(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)]
     # Each octave is e^-0.7 of the one before, within e, and one in twenty is as any amplitude.
 
     def following(log_px: Floats) -> Floats:
@@ -99,14 +116,24 @@ def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes() -> None:
         )
 
     steps, first = following(LOG_PX), last[1] @ following(last[0])
-    found = chain_means(first, moments)
-    by = [np.exp(-0.5 * ((e - np.exp(2 * LOG_PX)) / s) ** 2) for e, s in moments]
+    found = chain_means(first, moments, excess)
+    x = np.exp(2 * LOG_PX)
+    by = [np.exp(-0.5 * ((e - x) / s) ** 2) for e, s in moments]
     terms = first * by[0], steps * by[1], steps * by[2]
+    joint = np.einsum('a,ab,bc->abc', *terms)
+    if math.isfinite(excess[1]):
+        # Noise that each centroid has alone is as any amplitude.
+        log_noise = np.linspace(math.log(1e-9), math.log(0.5), 4000)
+        prior = norm.pdf(log_noise, math.log(1e-5), 4.0)
+        total = np.linspace(0.0, 5e-3, 800)
+        off = (excess[0] - total[:, None] - np.exp(2 * log_noise)) / excess[1]
+        likelihood = np.exp(-0.5 * off**2) @ prior
+        together = x[:, None, None] + x[:, None] + x
+        joint *= np.interp(together, total, likelihood, right=0.0)
     for k, one in enumerate(found):
-        marginal = np.einsum(f'a,ab,bc->{"abc"[k]}', *terms, optimize=True)
-        expected = marginal @ np.exp(2 * LOG_PX) / marginal.sum()
-        assert one == pytest.approx(expected, rel=1e-9)
-    assert found[0] == pytest.approx(4e-4, rel=0.3) and found[1] < found[0]
+        marginal = joint.sum(axis=tuple({0, 1, 2} - {k}))
+        assert one == pytest.approx(marginal @ x / marginal.sum(), rel=near)
+    assert found[0] > least and found[1] < found[0]
 
 
 def errors_of(
@@ -121,7 +148,8 @@ def errors_of(
     n = len(residual)
     kinds = observation_groups(pixels, star, WIDTH)
     rolled = np.tile(np.eye(2), (n, 1, 1)) if from_sky is None else from_sky
-    return shared_errors(residual, variance, np.ones(n, bool), kinds, rolled, last)
+    unknown = 0.0, math.inf  # excess of the variance of the centroids
+    return shared_errors(residual, variance, np.ones(n, bool), kinds, rolled, last, unknown)
 
 
 def random_rolls(rng: Generator, images: int, each: int = 1) -> Floats:
