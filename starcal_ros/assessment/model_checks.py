@@ -28,7 +28,6 @@ from starcal_ros.estimation.shared_errors import coarsest_cell_px
 from starcal_ros.estimation.unknowns import CHANGE, Layout, Unknown
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
 
-_MOST_LIKELY = 'most likely amplitude'
 _STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
 _MARGIN = 0.1  # ends of a side, as a share of it: lenses leave 0.25 px there that look like steps
 
@@ -59,16 +58,16 @@ def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:
     found, parts = estimate.posterior, len({t.axes for t in estimate.attitudes.trackers})
     octaves = float(np.sqrt((np.exp(found.field.log_px) ** 2).sum()))
     shape = float(np.sqrt((np.exp(found.shapes.amplitudes.log_px) ** 2).sum()))
+    term = float(np.exp(found.term.log_px[0]))
+    most_likely = (
+        ('field', octaves, found.field),
+        ('next term of the lens', term, found.term),
+        (CHANGE, shape, found.shapes.amplitudes),
+    )
     return (
-        Amplitude(f'field, {_MOST_LIKELY}', octaves, 'px', found.field.likelihood_ratio),
-        Amplitude(
-            f'next term of the lens, {_MOST_LIKELY}',
-            float(np.exp(found.term.log_px[0])),
-            'px',
-            found.term.likelihood_ratio,
-        ),
-        Amplitude(
-            f'{CHANGE}, {_MOST_LIKELY}', shape, 'px', found.shapes.amplitudes.likelihood_ratio
+        *(
+            Amplitude(f'{name}, most likely amplitude', size_px, 'px', one.likelihood_ratio)
+            for name, size_px, one in most_likely
         ),
         *(
             Amplitude(error.name, math.sqrt(error.variance_px2), 'px', error.likelihood_ratio)

@@ -48,7 +48,6 @@ from starcal_ros.estimation.unknowns import FIELD_OCTAVES
 _CELLS_PER_WAVE = 6.0
 _OF_ONE_LENGTH = 0.05  # chance that an octave leaves the chain: a ripple has one length only
 _TAIL = 2.0  # degrees of freedom of the errors of stars
-_GAUSSIAN_ENDS = 5.0  # sigma, beyond which a normal likelihood is below 1e-5
 _LOG_GRID = log_amplitudes(LARGEST_FIELD_PX)
 _PRIOR: Floats = np.exp(LogPrior().log_density(_LOG_GRID))
 
@@ -421,7 +420,8 @@ def _excess_waves(
         return np.zeros(1), np.ones(1, np.complex128), math.inf
     # The grids are no finer than this.
     sigma_px2 = math.hypot(sigma_px2, 2.0 * (_LOG_GRID[1] - _LOG_GRID[0]) * excess_px2)
-    most_px2 = excess_px2 + _GAUSSIAN_ENDS * sigma_px2
+    ends = math.sqrt(-math.log(ROUNDING))  # sigma: the square of the likelihood there is rounding
+    most_px2 = excess_px2 + ends * sigma_px2
     log_noise = _LOG_GRID
     if most_px2 > LARGEST_FIELD_PX**2:
         log_noise = log_amplitudes(math.sqrt(most_px2))
@@ -430,7 +430,7 @@ def _excess_waves(
     # The series repeats beyond the largest sum.
     period_px2 = (count + 1) * most_px2
     step = 2.0 * math.pi / period_px2
-    waves = np.arange(0.0, _GAUSSIAN_ENDS / sigma_px2 + step, step, np.float64)
+    waves = np.arange(0.0, ends / sigma_px2 + step, step, np.float64)
     turned = np.exp(1j * np.outer(waves, excess_px2 - noise_px2))
     size = np.exp(-0.5 * (waves * sigma_px2) ** 2) * np.where(waves > 0, 2.0, 1.0)
     return waves, size * (turned @ prior), most_px2

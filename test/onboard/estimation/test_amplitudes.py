@@ -324,7 +324,7 @@ def test_the_common_part_follows_from_the_correlation_in_time(
 
 def test_some_of_many_images_have_the_common_part_of_the_whole_campaign() -> None:
     made = images(np.random.default_rng(11), (3.0, 0.5, 0.3), 250, 8, 0.9, common=0.0)
-    found = shapes(dataclasses.replace(made.sums, time_s=np.arange(250.0)))
+    found = shapes(dataclasses.replace(made.sums, time_s=np.arange(250.0, dtype=np.float64)))
     # The mean correlation of 250 images is 0.07, that of their first hundred 0.17.
     assert found.common_px2[0] / found.sigma_px[0] ** 2 == pytest.approx(0.078, abs=0.01)
 
