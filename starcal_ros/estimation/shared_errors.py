@@ -29,7 +29,6 @@ from itertools import pairwise
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from starcal_ros.arrays import Floats, Indices, Mask
@@ -382,58 +381,43 @@ def chain_means(
     excess_px2 : (estimate, 1-sigma)
         Of the variance of centroids, not negative: noise, or these errors.
     """
-    x = np.exp(2.0 * _LOG_GRID)
-    log_likelihoods = [-0.5 * ((estimate - x) / sigma) ** 2 for estimate, sigma in moments]
-    # The likelihood of the sum of the errors as a Fourier series: each term is a product.
-    waves, of_noise, most_px2 = _excess_waves(*excess_px2, len(moments))
-    turned = np.exp(-1j * np.outer(x, waves)) * (x <= most_px2)[:, None]
-    likelihoods = [np.exp(one - one.max())[:, None] * turned for one in log_likelihoods]
-    transition = _transition()
-    before = [first[:, None] * of_noise]
-    for one in likelihoods[:-1]:
-        before.append(_product(transition.T, before[-1] * one))
-    after = np.ones_like(turned)
-    means = []
-    for likelihood, prior in zip(reversed(likelihoods), reversed(before), strict=True):
-        weight = (prior * likelihood * after).real.sum(axis=1)
-        means.append(float(weight @ x / weight.sum()))
-        after = _product(transition, likelihood * after)
-    return means[::-1]
+    transition, x = _transition(), np.exp(2.0 * _LOG_GRID)
+    off = [-0.5 * ((estimate - x) / sigma) ** 2 for estimate, sigma in moments]
+    by_pairs = [np.exp(one - one.max()) for one in off]
+    # Of a sum in which one error is large: the likelihood of each, less that of none large.
+    by_excess = _beside_noise(*excess_px2)
+    by_excess -= (1.0 - 1.0 / len(moments)) * by_excess[0]
+    total, means = 0.0, np.zeros(len(moments))
+    for large in range(len(moments)):
+        likelihoods = [one * by_excess if k == large else one for k, one in enumerate(by_pairs)]
+        before = [first]
+        for one in likelihoods[:-1]:
+            before.append((before[-1] * one) @ transition)
+        after = np.ones(len(x))
+        for k in reversed(range(len(moments))):
+            weight = before[k] * likelihoods[k] * after
+            means[k] += float(weight @ x)
+            after = transition @ (likelihoods[k] * after)
+        total += float(weight.sum())  # the same at each error
+    return [float(one) for one in means / total]
 
 
-def _product(matrix: Floats, columns: NDArray[np.complex128]) -> NDArray[np.complex128]:
-    """Return the product of a real matrix and complex columns, in half of the time."""
-    return np.asarray((matrix @ columns.view(np.float64)).view(np.complex128))
-
-
-def _excess_waves(
-    excess_px2: float, sigma_px2: float, count: int
-) -> tuple[Floats, NDArray[np.complexfloating], float]:
+def _beside_noise(excess_px2: float, sigma_px2: float) -> Floats:
     """
-    Return frequencies (w,), factors (w,) and the largest error of a likelihood of errors.
+    Return the likelihood (g,) of an error by an excess of the variance of centroids.
 
-    It is that of their sum by an excess of the variance of centroids.  The excess is that sum and
-    noise that each centroid has alone, which has the same prior as an error: where no two stars
-    are near each other, nothing else tells one from the other.
+    The excess is the error and noise that each centroid has alone, which has the same prior: where
+    no two stars are near each other, nothing else tells one from the other.  It bounds no error,
+    as the scale of the variance takes a part of it: the likelihood does not fall.
     """
     if not math.isfinite(sigma_px2):
-        return np.zeros(1), np.ones(1, np.complex128), math.inf
+        return np.ones(len(_LOG_GRID))
+    log_noise = log_amplitudes(max(LARGEST_FIELD_PX, 2.0 * math.sqrt(excess_px2)))
     # The grids are no finer than this.
     sigma_px2 = math.hypot(sigma_px2, 2.0 * (_LOG_GRID[1] - _LOG_GRID[0]) * excess_px2)
-    ends = math.sqrt(-math.log(ROUNDING))  # sigma: the square of the likelihood there is rounding
-    most_px2 = excess_px2 + ends * sigma_px2
-    log_noise = _LOG_GRID
-    if most_px2 > LARGEST_FIELD_PX**2:
-        log_noise = log_amplitudes(math.sqrt(most_px2))
-    noise_px2 = np.exp(2.0 * log_noise)
-    prior = np.exp(LogPrior().log_density(log_noise)) * (noise_px2 <= most_px2)
-    # The series repeats beyond the largest sum.
-    period_px2 = (count + 1) * most_px2
-    step = 2.0 * math.pi / period_px2
-    waves = np.arange(0.0, ends / sigma_px2 + step, step, np.float64)
-    turned = np.exp(1j * np.outer(waves, excess_px2 - noise_px2))
-    size = np.exp(-0.5 * (waves * sigma_px2) ** 2) * np.where(waves > 0, 2.0, 1.0)
-    return waves, size * (turned @ prior), most_px2
+    off = (excess_px2 - np.add.outer(np.exp(2.0 * _LOG_GRID), np.exp(2.0 * log_noise))) / sigma_px2
+    likelihood = np.exp(-0.5 * off**2) @ np.exp(LogPrior().log_density(log_noise))
+    return np.asarray(np.maximum.accumulate(likelihood))
 
 
 def pixel_variance_px2(errors: Sequence[SharedError]) -> float:
