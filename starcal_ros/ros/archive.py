@@ -185,6 +185,7 @@ class _RefusedFile:
     current: tuple[str, ...] = ()
     ended: tuple[str, ...] = ()
     camera_frame: str = ''
+    star_tracker_frame: str = ''
 
 
 @dataclass(frozen=True)
@@ -219,12 +220,18 @@ class Archive:
         The highest number given to any file.
     """
 
-    def __init__(self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        frame_id: str,
+        seal: Seal = CHECKSUMS,
+        star_tracker_frame: str = '',
+    ) -> None:
         self.folder = folder
         self._seal = seal
         self.damage: list[str] = []
         self.last_event = 0
-        self._frame_id = frame_id
+        self._frame_id, self._star_tracker_frame = frame_id, star_tracker_frame
         self._images: dict[int, _KeptImage] = {}  # by stamp: those on disk
         self._next_image = 1
         self._counts = _RefusedFile(ARCHIVE_SCHEMA)  # on disk
@@ -266,9 +273,9 @@ class Archive:
         return Collections(self._counts.current, self._counts.ended)
 
     @property
-    def camera_frame(self) -> str:
-        """The camera of the images on disk; empty if it is not recorded."""
-        return self._counts.camera_frame
+    def frames(self) -> tuple[str, str]:
+        """Camera and star tracker of the images on disk; empty where it is not recorded."""
+        return self._counts.camera_frame, self._counts.star_tracker_frame
 
     def read_ensemble(self) -> Ensemble:
         """The ensemble on disk, in order of arrival; damaged images are set aside."""
@@ -421,6 +428,7 @@ class Archive:
             collections.current,
             collections.ended,
             self._frame_id,
+            self._star_tracker_frame,
         )
         is_needed = ensemble.images or ensemble.refused or collections.ended
         if counts == self._counts or not is_needed:

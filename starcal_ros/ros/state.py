@@ -71,7 +71,7 @@ class CalibratorState:
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
-        self._camera: tuple[int, int, str] = (0, 0, '')  # camera of the records in memory
+        self._camera = (0, 0, '', '')  # camera of the records in memory
         self._on_disk = Kept()  # last written
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:
@@ -79,10 +79,10 @@ class CalibratorState:
         Join the records in memory with those of the state folder; without one, continue with them.
 
         The later activation is active, and nothing is dropped but by `reset`: images of another
-        size in the folder are set aside and counted. Records in memory of another camera stay in
-        their folder; where they are in none, they raise OptionError, as does a folder of another
-        camera. Raises ArchiveError when the folder, or its key, cannot be used. Memory and folder
-        are then as before.
+        size in the folder are set aside and counted. Records in memory of another camera (size or
+        frames) stay in their folder; where they are in none, they raise OptionError, as does a
+        folder of another camera. Raises ArchiveError when the folder, or its key, cannot be used.
+        Memory and folder are then as before.
 
         The last calibration is judged by the gate with the present setup before it is active.
         Where it is refused, the one that a roll-back would return to is judged, and so on; refused
@@ -97,7 +97,7 @@ class CalibratorState:
                     folder = Kept(
                         archive.read_ensemble(), archive.read_history(), archive.collections
                     )
-                    _check_camera(options.state_dir, folder, archive, memory, setup)
+                    _check_camera(options.state_dir, folder, archive.frames, setup)
                     folder = replace(folder, ensemble=_of_size(folder.ensemble, archive, setup))
                     kept = joined(folder, memory, archive.last_event)
                     if memory:
@@ -127,13 +127,14 @@ class CalibratorState:
         nothing = Kept(collections=replace(self._collections, current=()))
         if not memory:
             return nothing, ''
-        width, height, frame = self._camera
-        of_camera = f'{memory} are of a camera of {width} x {height} in {frame}'
+        width, height, *frames = self._camera
+        of_camera = f'{memory} are of a camera of {width} x {height}, {" in ".join(frames)}'
         if self._folder and memory == self._on_disk:
             return nothing, f'{of_camera}: they stay in {self._folder}'
         raise errors.OptionError(
-            f'camera_info_url, camera_frame: {of_camera}, and not on disk: configure with that '
-            'camera and a state_dir that can be written, or start the node again without them'
+            f'camera_info_url, camera_frame, star_tracker_frame: {of_camera}, and not on disk: '
+            'configure with that camera and a state_dir that can be written, or start the node '
+            'again without them'
         )
 
     def _accepted_from(self, event: int) -> tuple[records.Activation | None, dict[int, str]]:
@@ -414,34 +415,31 @@ def summary(calibration: records.Calibration) -> str:
     return '; '.join([fit, *requirement_answers(calibration)])
 
 
-def _camera_of(setup: Setup) -> tuple[int, int, str]:
-    """Size and frame: cameras with one sensor differ by their frame."""
-    camera = setup.prior.camera
-    return camera.width, camera.height, setup.frames.camera_frame
+def _camera_of(setup: Setup) -> tuple[int, int, str, str]:
+    """Size and frames: cameras with one sensor differ by their frames."""
+    camera, frames = setup.prior.camera, setup.frames
+    return camera.width, camera.height, frames.camera_frame, frames.star_tracker_frame
 
 
-def _check_camera(
-    state_dir: str, folder: Kept, archive: Archive, memory: Kept, setup: Setup
-) -> None:
-    """Raise OptionError where a folder is of another camera than the setup or the memory."""
-    prior = setup.prior.camera
-    cameras = [record.calibration.geometry.camera for record in folder.history]
-    sizes = {(one.width, one.height) for one in cameras}
+def _check_camera(state_dir: str, folder: Kept, frames: tuple[str, str], setup: Setup) -> None:
+    """Raise OptionError where a folder, with images of these frames, is of another camera."""
+    width, height, *own = _camera_of(setup)
+    calibrations = [record.calibration for record in folder.history]
+    sizes = {(one.geometry.camera.width, one.geometry.camera.height) for one in calibrations}
     sizes |= {(one.width, one.height) for one in folder.ensemble.images}
-    if sizes and (prior.width, prior.height) not in sizes:
-        width, height = min(sizes)
+    if sizes and (width, height) not in sizes:
+        other_width, other_height = min(sizes)
         raise errors.OptionError(
-            f'state_dir: {state_dir} is of a camera of {width} x {height}, '
-            f'the prior camera has {prior.width} x {prior.height}: choose another folder'
+            f'state_dir: {state_dir} is of a camera of {other_width} x {other_height}, '
+            f'the prior camera has {width} x {height}: choose another folder'
         )
-    # A folder alone may be of a frame that has another name since.
-    frame, known = setup.frames.camera_frame, set(folder.collections.current)
-    is_related = not known.isdisjoint(memory.collections.current)
-    if memory and folder and archive.camera_frame not in ('', frame) and not is_related:
-        raise errors.OptionError(
-            f'state_dir: {state_dir} is of the camera {archive.camera_frame}, {memory} in memory '
-            f'are of {frame}: choose another folder'
-        )
+    for stated in (frames, *((one.child_frame, one.parent_frame) for one in calibrations)):
+        if any(name not in ('', mine) for name, mine in zip(stated, own, strict=True)):
+            raise errors.OptionError(
+                f'state_dir: {state_dir} is of {" in ".join(filter(None, stated))}, the '
+                f'parameters of {" in ".join(own)} (camera_frame, star_tracker_frame): choose '
+                'another folder, or the names that this one has'
+            )
 
 
 def _of_size(
@@ -467,4 +465,5 @@ def _archive_of(setup: Setup, options: CalibratorOptions) -> Archive:
             ' restart loses the ensemble'
         ) from error
     seal = read_seal(options.state_key_file)
-    return Archive(Path(options.state_dir), setup.frames.camera_frame, seal)
+    frames = setup.frames
+    return Archive(Path(options.state_dir), frames.camera_frame, seal, frames.star_tracker_frame)

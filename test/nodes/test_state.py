@@ -159,6 +159,21 @@ def test_a_folder_of_another_camera_is_refused(tmp_path: Path) -> None:
     started(tmp_path / 'state').close()  # it was let go of
 
 
+@pytest.mark.parametrize('step', ['images 0', 'activate a'])
+@pytest.mark.parametrize('frames', ['navcam_2 star_tracker', 'camera star_tracker_2'])
+def test_a_folder_of_other_frames_is_refused_and_stays(
+    calibrators: Calibrators, step: str, frames: str
+) -> None:
+    """By a process that holds nothing too, whose calibration would be that of another camera."""
+    calibrators.run(f'open A; {step}; kill')
+    content = {path: path.read_bytes() for path in calibrators.disk.glob('A/*/*')}
+    words = f'A is of camera in star_tracker, the parameters of {frames.replace(" ", " in ")} '
+    with pytest.raises(OptionError, match=words):
+        calibrators.run(f'camera {frames}; open A')
+    assert content == {path: path.read_bytes() for path in calibrators.disk.glob('A/*/*')} != {}
+    calibrators.run('camera camera; open A')
+
+
 @pytest.mark.slow
 def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(tmp_path: Path) -> None:
     """Event 3 went back from 2 to 1: where 1 is refused, 2 must not come up again."""
