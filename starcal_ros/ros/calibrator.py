@@ -250,7 +250,7 @@ class Calibrator(node.StarcalNode):
             )
 
     def _on_observations(self, message: Any) -> None:
-        observations = checked_observations(message)
+        observations = checked_observations(message, self._setup.frames.camera_frame)
         if observations.refusal == 'bad_observations':
             self.get_logger().warning(f'observations refused: {observations.detail}')
         self._state.add(observations)

@@ -311,7 +311,7 @@ def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
     for info in infos:
         expected.header = info.header
         assert info == expected
-    forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
+    forced = dataclasses.replace(candidate, forced=True)
     calibrations.publish(calibration_to_message(forced, make_message))
     vehicle.until(lambda: observer.said().count('predicting stars') == 2)
     header = show(8)
@@ -330,14 +330,17 @@ def test_calibrator_collects_while_it_solves(vehicle: Vehicle) -> None:
     vehicle.until(solve.service_is_ready)
     futures = [solve.call_async(Calibrate.Request(dry_run=True)) for _ in range(5)]
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
+    of_other = dataclasses.replace(tiny_observations().images[0], time_ns=1)
+    observations.publish(observations_to_message(of_other, 'right_camera', make_message))
     for k in range(300):
         refused = refused_image(k, 8, 8, 'no_stars', '')
         observations.publish(observations_to_message(refused, '', make_message))
     vehicle.until(lambda: all(future.done() for future in futures))
     assert all(future.result().success for future in futures)
-    expected, told = [('bad_observations', 1), ('no_stars', 300)], vehicle.statuses()
+    expected, told = [('bad_observations', 2), ('no_stars', 300)], vehicle.statuses()
     vehicle.until(lambda: [(one.reason, one.count) for one in told[-1].refused] == expected)
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
+    assert "header.frame_id: 'right_camera' is not camera, camera_frame" in calibrator.said()
     assert 'Traceback' not in calibrator.said()
 
 

@@ -25,6 +25,7 @@ from starcal_ros.records import (
     EnsembleStatus,
     StarObservations,
 )
+from starcal_ros.untrusted import shown
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # smallest and largest that a measured star has
 _LONGEST_DETAIL = 500  # characters
@@ -92,13 +93,19 @@ def _forget_zeros(values: dict[str, Any]) -> None:
     values['velocity_sigma_m_s'] = stated.get(velocity, velocity)
 
 
-def checked_observations(message: codec.Message) -> StarObservations:
+def checked_observations(message: codec.Message, camera_frame: str = '') -> StarObservations:
     """
     Observations of a starcal/StarObservations, refused where they hold impossible values.
 
-    The refusal is ``bad_observations``, with the field and its value.
+    Those of another camera are refused too, if ``camera_frame`` is given and the message names
+    one.  The refusal is ``bad_observations``, with the field and its value.
     """
     try:
+        frame = message.header.frame_id
+        if camera_frame and frame not in ('', camera_frame):
+            raise ValueError(
+                f'header.frame_id: {shown(frame)} is not {camera_frame}, camera_frame'
+            )
         return observations_from_message(message)
     except ValueError as error:
         detail = ' '.join(str(error).split())[:_LONGEST_DETAIL]
