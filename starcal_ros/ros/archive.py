@@ -253,7 +253,14 @@ class Archive:
 
     def saved(self, ensemble: Ensemble) -> int:
         """Number of images of an ensemble on disk."""
-        return sum(map(self._holds, ensemble.images))
+        return sum(map(self._holds, ensemble.images)) if self.is_in_place() else 0
+
+    def is_in_place(self) -> bool:
+        """True while the path leads to the folder that is locked, which may be replaced."""
+        try:
+            return os.path.samestat(os.fstat(self._lock), self.folder.stat())
+        except OSError:
+            return False
 
     def _holds(self, image: StarObservations) -> bool:
         # Not by its stamp: after a reset that failed on disk, another image may have it.
@@ -363,9 +370,14 @@ class Archive:
 
         A new image costs one file.  Where all collections on disk have ended, their images are
         removed first, in one step.  Without ``collections`` those on disk stay.  Raises
-        ArchiveError when writing fails; the files on disk are intact then, and the next call
-        continues.
+        ArchiveError when writing fails, or the folder is another than the one that is locked; the
+        files on disk are intact then, and the next call continues.
         """
+        if not self.is_in_place():
+            raise ArchiveError(
+                f'state_dir: {self.folder} was removed or replaced; put it back, or clean up and '
+                'configure the calibrator to write all to the new one'
+            )
         stamps = {image.time_ns for image in ensemble.images}
         collections = collections or self.collections
         try:

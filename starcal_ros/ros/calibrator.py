@@ -257,7 +257,7 @@ class Calibrator(node.StarcalNode):
         self._status_is_due.set()
 
     def _save_again(self) -> None:
-        if self._state.trouble:
+        if self._state.is_unsaved:
             self._state.save()
             self._status_is_due.set()
 

@@ -337,6 +337,13 @@ class CalibratorState:
         except Exception as error:  # whatever it is, the records are not on disk
             self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
 
+    @property
+    def is_unsaved(self) -> bool:
+        """True if the last attempt to save failed, or the folder was replaced since."""
+        with self._disk:
+            is_lost = self._archive is not None and not self._archive.is_in_place()
+        return bool(self.trouble) or is_lost
+
     def disk_free_bytes(self) -> int | None:
         """Free space for the state folder; None without one."""
         with self._disk:

@@ -62,6 +62,8 @@ damaged event -> none | b a
     open A; activate a; activate b; close; cut A/calibrations/*2.json; open A
 removed folder -> 0 1 | a
     open A; images 0 1; activate a; close; remove A; open A
+folder removed in use -> 0 1 | b a
+    open A; images 0; activate a; remove A; images 1; activate b; open A
 reset -> 3 | none
     open A; images 0 1; reset; images 3
 # A reset is an event of the images: they do not come back from anywhere.

@@ -9,6 +9,7 @@ import itertools
 import json
 from pathlib import Path
 import re
+import shutil
 from typing import Any
 
 from attacks import bag_setup, observations  # type: ignore[import-not-found]
@@ -124,6 +125,16 @@ def test_a_full_disk_costs_nothing_that_memory_holds(tmp_path: Path) -> None:
     state.close()
     state = started(tmp_path)
     assert len(state.ensemble.images) == len(observations()) and state.active is not None
+    state.close()
+
+
+def test_a_removed_folder_is_noticed_without_an_image(tmp_path: Path) -> None:
+    state = filled(observations()[:1], tmp_path / 'A')
+    assert not state.is_unsaved
+    shutil.rmtree(tmp_path / 'A')
+    assert state.is_unsaved and state.status().images_saved == 0
+    state.save()
+    assert 'was removed or replaced' in state.trouble
     state.close()
 
 
