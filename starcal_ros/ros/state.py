@@ -51,10 +51,14 @@ class CalibratorState:
     ----------
     now_ns : callable
         The time, read at the moment of an activation: a solve may take minutes.
+    on_trouble : callable
+        Called with each change of `trouble`, before the lock of the disk is released.
     """
 
-    def __init__(self, now_ns: Callable[[], int]) -> None:
-        self._now_ns = now_ns
+    def __init__(
+        self, now_ns: Callable[[], int], on_trouble: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._now_ns, self._on_trouble = now_ns, on_trouble
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         # By number: why the gate of today refuses the last calibrations.
@@ -328,14 +332,18 @@ class CalibratorState:
         with self._records:
             kept = Kept(self._ensemble, self._history, self._collections)
             active, withdrawn = self._active, self._withdrawn()
+        trouble = ''
         try:
             self._archive.keep(kept.ensemble, kept.history, kept.collections)
             self._archive.keep_active(active, withdrawn)
-            self._on_disk, self.trouble = kept, ''
+            self._on_disk = kept
         except errors.ArchiveError as error:
-            self.trouble = str(error)
+            trouble = str(error)
         except Exception as error:  # whatever it is, the records are not on disk
-            self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
+            trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
+        if trouble != self.trouble:
+            self.trouble = trouble
+            self._on_trouble(trouble)
 
     @property
     def is_unsaved(self) -> bool:
@@ -378,8 +386,9 @@ class CalibratorState:
         return replace(answer, calibration=active, active=True)
 
     def _answer(self, message: str) -> Answer:
-        unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''
-        return Answer(True, message + unsaved)
+        # First: an answer of a service is cut at its end.
+        unsaved = f'not on disk: {self.trouble}; ' if self.trouble else ''
+        return Answer(True, unsaved + message)
 
 
 def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str, ...]:

@@ -109,19 +109,22 @@ def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(tmp_path: Path) -> No
 
 
 def test_a_full_disk_costs_nothing_that_memory_holds(tmp_path: Path) -> None:
-    state = filled(observations()[:-1], tmp_path)
+    state, told = filled(observations()[:-1], tmp_path), list[str]()
+    state._on_trouble = told.append
     with full_disk():
         state.add(observations()[-1])
         answer = state.solve()
         status = state.status()
-    assert answer.success and 'not on disk: state_dir:' in answer.message
+    assert answer.success and answer.message.startswith('not on disk: state_dir:')
+    assert told[0].startswith('state_dir:') and told[-1] == state.trouble
     assert (status.images, status.images_saved) == (len(observations()), len(observations()) - 1)
     assert 'cannot be written: File too large' in state.trouble
     assert (state.disk_free_bytes() or 0) > 0
     # The folder is let go of and taken up again before the disk has room: nothing is lost.
     state.close()
     state.open(bag_setup(), CalibratorOptions(state_dir=str(tmp_path)))
-    assert state.trouble == '' and state.status().images_saved == len(observations())
+    assert state.trouble == told[-1] == '' and '' not in told[:-1]
+    assert state.status().images_saved == len(observations())
     state.close()
     state = started(tmp_path)
     assert len(state.ensemble.images) == len(observations()) and state.active is not None
