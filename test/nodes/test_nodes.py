@@ -367,8 +367,13 @@ OBSERVER, CALIBRATOR = BOTH
         (OBSERVER, lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
         (CALIBRATOR, broken_file, 'params.yaml'),
         ('bag_player', lambda *_: (), 'bag: path of the bag to play is missing'),
-        ('bag_player', lambda *_: ('-p', 'bag:=/no/bag'), '/no/bag: no such file or folder'),
+        ('bag_player', lambda f, _: parameters(f, 'bag:=/no/bag'), '/no/bag: no such file or fol'),
         ('bag_player', lambda *_: ('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
+        (
+            'bag_player',
+            lambda *_: ('-p', 'bagg:=x'),
+            'bagg: no such parameter (did you mean bag?)',
+        ),
     ],
 )
 def test_bad_parameters(
@@ -405,14 +410,21 @@ def test_parameters_while_running(vehicle: Vehicle) -> None:
     assert set_gap(vehicle, 1.0) == ''
     assert 'max_attitude_gap_s' in set_gap(vehicle, -1.0)
     assert 'Type' in set_gap(vehicle, 1.0, 41)
+    known = '(did you mean max_attitude_gap_s?)'
+    assert known in set_gap(vehicle, 1.0, name='max_atitude_gap_s')
     assert manager.change(CONFIGURE) and manager.change(ACTIVATE)
     assert node.process.poll() is None
 
 
-def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DOUBLE) -> str:
+def set_gap(
+    client: Client,
+    value: float,
+    kind: int = ParameterType.PARAMETER_DOUBLE,
+    name: str = 'max_attitude_gap_s',
+) -> str:
     """Set a parameter; return the reason of a refusal, '' if accepted."""
     number = ParameterValue(type=kind, double_value=value)
-    parameter = Parameter(name='max_attitude_gap_s', value=number)
+    parameter = Parameter(name=name, value=number)
     answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
     return '' if answer.results[0].successful else str(answer.results[0].reason)
 
