@@ -114,6 +114,11 @@ def checked_observations(message: codec.Message, camera_frame: str = '') -> Star
 
 def _check_stars(record: StarObservations) -> None:
     """Raise ValueError for values of one field that those of another exclude."""
+    if not (len(record) or record.refusal):
+        raise ValueError('refusal: empty, but the image has no stars')
+    stars, times = np.unique(record.catalog_id, return_counts=True)
+    if (times > 1).any():
+        raise ValueError(f'catalog_id: {int(stars[times.argmax()])} is given twice')
     reasons = len(record.refused_stars)
     if (record.refused_reason >= reasons).any():
         raise ValueError(
