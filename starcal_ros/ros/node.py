@@ -338,6 +338,8 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
                 is_transition = isinstance(response, ChangeState.Response)
                 if self.failure and is_transition and not response.success:
                     self.get_logger().error(self.failure)
+                if is_transition:
+                    self.guarded(self.publish_health_change)()
                 return response
 
             return answer
@@ -533,7 +535,9 @@ def _end(node: StarcalNode | None, executor: Executor | None) -> None:
 
 def _start(node: StarcalNode) -> bool:
     success = TransitionCallbackReturn.SUCCESS
-    return bool(node.trigger_configure() == success and node.trigger_activate() == success)
+    is_active = node.trigger_configure() == success and node.trigger_activate() == success
+    node.guarded(node.publish_health_change)()
+    return bool(is_active)
 
 
 def _spin(node: StarcalNode, executor: Executor) -> None:
