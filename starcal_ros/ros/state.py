@@ -403,6 +403,9 @@ def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str,
     if (camera.width, camera.height) != (prior.width, prior.height):
         size = f'it is of a camera of {camera.width} x {camera.height}'
         return (f'{size}, the prior camera has {prior.width} x {prior.height}',)
+    frames, own = _frames_of(calibration), _camera_of(setup)[2:]
+    if frames != own:
+        return (f'it is of {" in ".join(frames)}, the parameters of {" in ".join(own)}',)
     if not (calibration.accepted or calibration.forced):
         return ('its file states that the gate refused it', *calibration.reasons)
     try:
@@ -439,7 +442,7 @@ def _camera_of(setup: Setup) -> tuple[int, int, str, str]:
 
 def _check_camera(state_dir: str, folder: Kept, frames: tuple[str, str], setup: Setup) -> None:
     """Raise OptionError where a folder, with images of these frames, is of another camera."""
-    width, height, *own = _camera_of(setup)
+    (width, height), own = _camera_of(setup)[:2], _camera_of(setup)[2:]
     calibrations = [record.calibration for record in folder.history]
     sizes = {(one.geometry.camera.width, one.geometry.camera.height) for one in calibrations}
     sizes |= {(one.width, one.height) for one in folder.ensemble.images}
@@ -449,13 +452,18 @@ def _check_camera(state_dir: str, folder: Kept, frames: tuple[str, str], setup: 
             f'state_dir: {state_dir} is of a camera of {other_width} x {other_height}, '
             f'the prior camera has {width} x {height}: choose another folder'
         )
-    for stated in (frames, *((one.child_frame, one.parent_frame) for one in calibrations)):
-        if any(name not in ('', mine) for name, mine in zip(stated, own, strict=True)):
-            raise errors.OptionError(
-                f'state_dir: {state_dir} is of {" in ".join(filter(None, stated))}, the '
-                f'parameters of {" in ".join(own)} (camera_frame, star_tracker_frame): choose '
-                'another folder, or the names that this one has'
-            )
+    pairs = (frames, *(_frames_of(one) for one in calibrations))
+    stated = {(camera, tracker or own[1]) for camera, tracker in pairs if camera}
+    if stated and own not in stated:
+        raise errors.OptionError(
+            f'state_dir: {state_dir} is of {" in ".join(min(stated))}, the parameters of '
+            f'{" in ".join(own)} (camera_frame, star_tracker_frame): choose another folder, or '
+            'the names that this one has'
+        )
+
+
+def _frames_of(calibration: records.Calibration) -> tuple[str, str]:
+    return calibration.child_frame, calibration.parent_frame
 
 
 def _of_size(

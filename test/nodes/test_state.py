@@ -188,6 +188,17 @@ def test_a_folder_of_other_frames_is_refused_and_stays(
     calibrators.run('camera camera; open A')
 
 
+def test_one_calibration_of_other_frames_is_not_active(calibrators: Calibrators) -> None:
+    calibrators.run('open A; activate a; activate b; kill')
+    (path,) = calibrators.disk.glob('A/calibrations/*2.json')
+    content = CHECKSUMS.opened(path.read_bytes())
+    of_other = {**content, 'alignment': {**content['alignment'], 'child': 'other'}}
+    path.write_text(CHECKSUMS.sealed(of_other))
+    state = calibrators.run('open A')
+    assert 'it is of other in star_tracker, the parameters of camera in' in state.withheld[2]
+    assert state.active is not None and state.active.weakest_direction == 'a'
+
+
 @pytest.mark.slow
 def test_a_forged_verdict_does_not_go_past_a_rolled_back_one(tmp_path: Path) -> None:
     """Event 3 went back from 2 to 1: where 1 is refused, 2 must not come up again."""
