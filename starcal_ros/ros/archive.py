@@ -221,17 +221,13 @@ class Archive:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        frame_id: str,
-        seal: Seal = CHECKSUMS,
-        star_tracker_frame: str = '',
+        self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS, tracker_frame: str = ''
     ) -> None:
         self.folder = folder
         self._seal = seal
         self.damage: list[str] = []
         self.last_event = 0
-        self._frame_id, self._star_tracker_frame = frame_id, star_tracker_frame
+        self._frame_id, self._tracker_frame = frame_id, tracker_frame
         self._images: dict[int, _KeptImage] = {}  # by stamp: those on disk
         self._next_image = 1
         self._counts = _RefusedFile(ARCHIVE_SCHEMA)  # on disk
@@ -257,10 +253,9 @@ class Archive:
 
     def is_in_place(self) -> bool:
         """True while the path leads to the folder that is locked, which may be replaced."""
-        try:
+        with contextlib.suppress(OSError):
             return os.path.samestat(os.fstat(self._lock), self.folder.stat())
-        except OSError:
-            return False
+        return False
 
     def _holds(self, image: StarObservations) -> bool:
         # Not by its stamp: after a reset that failed on disk, another image may have it.
@@ -375,8 +370,7 @@ class Archive:
         """
         if not self.is_in_place():
             raise ArchiveError(
-                f'state_dir: {self.folder} was removed or replaced; put it back, or clean up and '
-                'configure the calibrator to write all to the new one'
+                f'state_dir: {self.folder} was removed or replaced; put it back or configure again'
             )
         stamps = {image.time_ns for image in ensemble.images}
         collections = collections or self.collections
@@ -440,7 +434,7 @@ class Archive:
             collections.current,
             collections.ended,
             self._frame_id,
-            self._star_tracker_frame,
+            self._tracker_frame,
         )
         is_needed = ensemble.images or ensemble.refused or collections.ended
         if counts == self._counts or not is_needed:

@@ -65,11 +65,7 @@ class OptionParameters:
         return values
 
     def check_names(self, of_others: Collection[str] = ()) -> None:
-        """
-        Raise OptionError for a name given at start that no option has: ROS passes over it.
-
-        ``of_others`` are names for other nodes, with which one file may be shared.
-        """
+        """Raise OptionError for a name given at start that no node has: ROS passes over it."""
         given = getattr(self._node, '_parameter_overrides', {})  # rclpy has no other access to it
         if why := self.why_unknown(name for name in sorted(given) if name not in of_others):
             raise OptionError(why)

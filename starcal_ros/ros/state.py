@@ -45,14 +45,12 @@ class CalibratorState:
 
     Both are frozen records: a solve works on the ensemble it began with while the next grows.
     With a state folder both are on disk before they are published; while the disk fails they are
-    in memory, `trouble` has the cause, and `save` tries again.
+    in memory, `trouble` has the cause, `on_trouble` is told each change, and `save` tries again.
 
     Parameters
     ----------
     now_ns : callable
         The time, read at the moment of an activation: a solve may take minutes.
-    on_trouble : callable
-        Called with each change of `trouble`, before the lock of the disk is released.
     """
 
     def __init__(
@@ -136,9 +134,8 @@ class CalibratorState:
         if self._folder and memory == self._on_disk:
             return nothing, f'{of_camera}: they stay in {self._folder}'
         raise errors.OptionError(
-            f'camera_info_url, camera_frame, star_tracker_frame: {of_camera}, and not on disk: '
-            'configure with that camera and a state_dir that can be written, or start the node '
-            'again without them'
+            f'camera_info_url, camera_frame: {of_camera}, and not on disk: configure with that '
+            'camera and a state_dir that can be written, or start the node again without them'
         )
 
     def _accepted_from(self, event: int) -> tuple[records.Activation | None, dict[int, str]]:
@@ -349,8 +346,7 @@ class CalibratorState:
     def is_unsaved(self) -> bool:
         """True if the last attempt to save failed, or the folder was replaced since."""
         with self._disk:
-            is_lost = self._archive is not None and not self._archive.is_in_place()
-        return bool(self.trouble) or is_lost
+            return bool(self.trouble or (self._archive and not self._archive.is_in_place()))
 
     def disk_free_bytes(self) -> int | None:
         """Free space for the state folder; None without one."""
@@ -403,7 +399,7 @@ def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str,
     if (camera.width, camera.height) != (prior.width, prior.height):
         size = f'it is of a camera of {camera.width} x {camera.height}'
         return (f'{size}, the prior camera has {prior.width} x {prior.height}',)
-    frames, own = _frames_of(calibration), _camera_of(setup)[2:]
+    frames, own = (calibration.child_frame, calibration.parent_frame), _camera_of(setup)[2:]
     if frames != own:
         return (f'it is of {" in ".join(frames)}, the parameters of {" in ".join(own)}',)
     if not (calibration.accepted or calibration.forced):
@@ -442,28 +438,21 @@ def _camera_of(setup: Setup) -> tuple[int, int, str, str]:
 
 def _check_camera(state_dir: str, folder: Kept, frames: tuple[str, str], setup: Setup) -> None:
     """Raise OptionError where a folder, with images of these frames, is of another camera."""
-    (width, height), own = _camera_of(setup)[:2], _camera_of(setup)[2:]
+    given = _camera_of(setup)
     calibrations = [record.calibration for record in folder.history]
     sizes = {(one.geometry.camera.width, one.geometry.camera.height) for one in calibrations}
     sizes |= {(one.width, one.height) for one in folder.ensemble.images}
-    if sizes and (width, height) not in sizes:
-        other_width, other_height = min(sizes)
-        raise errors.OptionError(
-            f'state_dir: {state_dir} is of a camera of {other_width} x {other_height}, '
-            f'the prior camera has {width} x {height}: choose another folder'
-        )
-    pairs = (frames, *(_frames_of(one) for one in calibrations))
-    stated = {(camera, tracker or own[1]) for camera, tracker in pairs if camera}
-    if stated and own not in stated:
-        raise errors.OptionError(
-            f'state_dir: {state_dir} is of {" in ".join(min(stated))}, the parameters of '
-            f'{" in ".join(own)} (camera_frame, star_tracker_frame): choose another folder, or '
-            'the names that this one has'
-        )
-
-
-def _frames_of(calibration: records.Calibration) -> tuple[str, str]:
-    return calibration.child_frame, calibration.parent_frame
+    pairs = (frames, *((one.child_frame, one.parent_frame) for one in calibrations))
+    named = {(camera, tracker or given[3]) for camera, tracker in pairs if camera}
+    for form, stated, own in (
+        ('a camera of {} x {}', sizes, given[:2]),
+        ('camera_frame {} in {}', named, given[2:]),
+    ):
+        if stated and own not in stated:
+            raise errors.OptionError(
+                f'state_dir: {state_dir} is of {form.format(*min(stated))}, the parameters of '
+                f'{form.format(*own)}: choose another folder, or the camera of this one'
+            )
 
 
 def _of_size(

@@ -133,7 +133,7 @@ of another camera -> 2 images and 1 activation are of .*, camera in star_tracker
     open -; images 0 1; activate m; camera navcam_2; open A
 not saved of another -> and not on disk: configure with that camera and a state_dir that can be
     open A; images 0; full; images 1; activate m; close; room; camera navcam_2; open -
-a folder of another -> A is of navcam_1 in star_tracker, the parameters of camera in star_tracker
+a folder of another -> A is of camera_frame navcam_1 in star_tracker, the parameters of camera_fr
     camera navcam_1; P2 open A; P2 images 2; P2 close; camera camera;
     open -; images 0 1; activate m; open A
 in use -> in use by another calibrator

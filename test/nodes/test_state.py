@@ -181,7 +181,9 @@ def test_a_folder_of_other_frames_is_refused_and_stays(
     """By a process that holds nothing too, whose calibration would be that of another camera."""
     calibrators.run(f'open A; {step}; kill')
     content = {path: path.read_bytes() for path in calibrators.disk.glob('A/*/*')}
-    words = f'A is of camera in star_tracker, the parameters of {frames.replace(" ", " in ")} '
+    words = (
+        f'camera in star_tracker, the parameters of camera_frame {frames.replace(" ", " in ")}:'
+    )
     with pytest.raises(OptionError, match=words):
         calibrators.run(f'camera {frames}; open A')
     assert content == {path: path.read_bytes() for path in calibrators.disk.glob('A/*/*')} != {}

@@ -95,10 +95,9 @@ def _forget_zeros(values: dict[str, Any]) -> None:
 
 def checked_observations(message: codec.Message, camera_frame: str = '') -> StarObservations:
     """
-    Observations of a starcal/StarObservations, refused where they hold impossible values.
+    Observations of a starcal/StarObservations, refused if impossible or of another camera.
 
-    Those of another camera are refused too, if ``camera_frame`` is given and the message names
-    one.  The refusal is ``bad_observations``, with the field and its value.
+    The refusal is ``bad_observations``, with the field and its value.
     """
     try:
         frame = message.header.frame_id
