@@ -126,10 +126,14 @@ class Calibrators:
         gate = dataclasses.replace(self.setup.gate, max_change_px=float(max_change_px))
         self.setup = dataclasses.replace(self.setup, gate=gate)
 
-    def camera(self, _process: str, frame: str) -> None:
+    def camera(self, _process: str, frame: str, star_tracker: str = 'star_tracker') -> None:
         """Configure the camera of a frame from now on, with the same sensor."""
-        frames = dataclasses.replace(self.setup.frames, camera_frame=frame)
-        self.setup = dataclasses.replace(self.setup, frames=frames)
+        self.setup = dataclasses.replace(
+            self.setup,
+            frames=dataclasses.replace(
+                self.setup.frames, camera_frame=frame, star_tracker_frame=star_tracker
+            ),
+        )
 
     def turn(self, _process: str, degrees: str) -> None:
         """Turn the mounting of the prior about the boresight."""

@@ -20,7 +20,8 @@ from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ros.constants import NANOSECONDS_PER_SECOND
 from starcal_ros.errors import BagError
 from starcal_ros.formats.messages import message_codec
-from starcal_ros.options import from_mapping
+from starcal_ros.options import from_mapping, names_of
+from starcal_ros.pipeline.setup import NODE_OPTION_CLASSES, OPTION_CLASSES
 from starcal_ros.ros import inputs, node, parameters, printable_log
 
 NAME = 'bag_player'
@@ -47,9 +48,9 @@ class BagPlayer(printable_log.PrintableLog):
 
     def __init__(self) -> None:
         super().__init__(NAME)
-        self.own = from_mapping(
-            PlayerOptions, parameters.OptionParameters(self, [PlayerOptions]).values()
-        )
+        given = parameters.OptionParameters(self, [PlayerOptions])
+        given.check_names(names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES))
+        self.own = from_mapping(PlayerOptions, given.values())
         if not self.own.bag:
             raise BagError('bag: path of the bag to play is missing')
         self._topics = self._played()

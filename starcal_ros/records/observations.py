@@ -41,8 +41,8 @@ IMAGE_REFUSALS: Mapping[str, str] = {
     'too_few_stars': 'too few stars were measured well',
     'bad_stamp': 'the stamp, with stamp_offset_s, is negative or beyond the range of ROS stamps',
     'bad_observations': (
-        'the observations cannot be decoded, or contain impossible values'
-        ' (reported by the calibrator)'
+        'the observations cannot be decoded, contain impossible values, or are of another'
+        ' camera_frame (reported by the calibrator)'
     ),
     'overrun': 'images came faster than they could be measured',
     'internal_error': 'the measurement failed unexpectedly; the log of the node has the cause',

@@ -185,6 +185,7 @@ class _RefusedFile:
     current: tuple[str, ...] = ()
     ended: tuple[str, ...] = ()
     camera_frame: str = ''
+    star_tracker_frame: str = ''
 
 
 @dataclass(frozen=True)
@@ -219,12 +220,14 @@ class Archive:
         The highest number given to any file.
     """
 
-    def __init__(self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS) -> None:
+    def __init__(
+        self, folder: Path, frame_id: str, seal: Seal = CHECKSUMS, tracker_frame: str = ''
+    ) -> None:
         self.folder = folder
         self._seal = seal
         self.damage: list[str] = []
         self.last_event = 0
-        self._frame_id = frame_id
+        self._frame_id, self._tracker_frame = frame_id, tracker_frame
         self._images: dict[int, _KeptImage] = {}  # by stamp: those on disk
         self._next_image = 1
         self._counts = _RefusedFile(ARCHIVE_SCHEMA)  # on disk
@@ -246,7 +249,13 @@ class Archive:
 
     def saved(self, ensemble: Ensemble) -> int:
         """Number of images of an ensemble on disk."""
-        return sum(map(self._holds, ensemble.images))
+        return sum(map(self._holds, ensemble.images)) if self.is_in_place() else 0
+
+    def is_in_place(self) -> bool:
+        """True while the path leads to the folder that is locked, which may be replaced."""
+        with contextlib.suppress(OSError):
+            return os.path.samestat(os.fstat(self._lock), self.folder.stat())
+        return False
 
     def _holds(self, image: StarObservations) -> bool:
         # Not by its stamp: after a reset that failed on disk, another image may have it.
@@ -266,9 +275,9 @@ class Archive:
         return Collections(self._counts.current, self._counts.ended)
 
     @property
-    def camera_frame(self) -> str:
-        """The camera of the images on disk; empty if it is not recorded."""
-        return self._counts.camera_frame
+    def frames(self) -> tuple[str, str]:
+        """Camera and star tracker of the images on disk; empty where it is not recorded."""
+        return self._counts.camera_frame, self._counts.star_tracker_frame
 
     def read_ensemble(self) -> Ensemble:
         """The ensemble on disk, in order of arrival; damaged images are set aside."""
@@ -356,9 +365,13 @@ class Archive:
 
         A new image costs one file.  Where all collections on disk have ended, their images are
         removed first, in one step.  Without ``collections`` those on disk stay.  Raises
-        ArchiveError when writing fails; the files on disk are intact then, and the next call
-        continues.
+        ArchiveError when writing fails, or the folder is another than the one that is locked; the
+        files on disk are intact then, and the next call continues.
         """
+        if not self.is_in_place():
+            raise ArchiveError(
+                f'state_dir: {self.folder} was removed or replaced; put it back or configure again'
+            )
         stamps = {image.time_ns for image in ensemble.images}
         collections = collections or self.collections
         try:
@@ -421,6 +434,7 @@ class Archive:
             collections.current,
             collections.ended,
             self._frame_id,
+            self._tracker_frame,
         )
         is_needed = ensemble.images or ensemble.refused or collections.ended
         if counts == self._counts or not is_needed:

@@ -72,7 +72,7 @@ class Calibrator(node.StarcalNode):
         super().__init__(NAME)
         self._listeners: list[tuple[Any, Any]] = []
         self._publishing = threading.Lock()
-        self._state = CalibratorState(self._now_ns)
+        self._state = CalibratorState(self._now_ns, self._log_trouble)
         self._last_answer = Answer(True, '')
         self._last_gate = 'none'
         self._driver: CameraDriver | None = None
@@ -250,14 +250,20 @@ class Calibrator(node.StarcalNode):
             )
 
     def _on_observations(self, message: Any) -> None:
-        observations = checked_observations(message)
+        observations = checked_observations(message, self._setup.frames.camera_frame)
         if observations.refusal == 'bad_observations':
             self.get_logger().warning(f'observations refused: {observations.detail}')
         self._state.add(observations)
         self._status_is_due.set()
 
+    def _log_trouble(self, trouble: str) -> None:
+        if trouble:
+            self.get_logger().error(f'state not saved, in memory only: {trouble}')
+        else:
+            self.get_logger().info('state saved again')
+
     def _save_again(self) -> None:
-        if self._state.trouble:
+        if self._state.is_unsaved:
             self._state.save()
             self._status_is_due.set()
 

@@ -34,6 +34,7 @@ from rclpy.exceptions import ROSInterruptException
 from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 
 from starcal_ros.errors import StarcalError
@@ -124,6 +125,12 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
     def needed(self) -> list[str]:
         """Return the topics that the node cannot do without, by their names on the graph."""
         return []
+
+    def set_parameters_atomically(self, parameter_list: list[Parameter]) -> SetParametersResult:
+        """Set parameters; an unknown name is refused with a similar one, which rclpy has not."""
+        if why := self.options.why_unknown(one.name for one in parameter_list):
+            return SetParametersResult(successful=False, reason=why)
+        return super().set_parameters_atomically(parameter_list)
 
     def taken(self, callback: Callable[[Any], None]) -> int:
         """Return the number of messages that a callback, wrapped by `taking`, has had."""
@@ -331,6 +338,8 @@ class StarcalNode(printable_log.PrintableLog, LifecycleNode):
                 is_transition = isinstance(response, ChangeState.Response)
                 if self.failure and is_transition and not response.success:
                     self.get_logger().error(self.failure)
+                if is_transition:
+                    self.guarded(self.publish_health_change)()
                 return response
 
             return answer
@@ -526,7 +535,9 @@ def _end(node: StarcalNode | None, executor: Executor | None) -> None:
 
 def _start(node: StarcalNode) -> bool:
     success = TransitionCallbackReturn.SUCCESS
-    return bool(node.trigger_configure() == success and node.trigger_activate() == success)
+    is_active = node.trigger_configure() == success and node.trigger_activate() == success
+    node.guarded(node.publish_health_change)()
+    return bool(is_active)
 
 
 def _spin(node: StarcalNode, executor: Executor) -> None:

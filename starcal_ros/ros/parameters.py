@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 import dataclasses
 import itertools
 from pathlib import Path
@@ -64,12 +64,16 @@ class OptionParameters:
                 values |= paths_from({name: value}, folder)
         return values
 
-    def check_names(self) -> None:
-        """Raise OptionError for a name given at start that no option has: ROS passes over it."""
+    def check_names(self, of_others: Collection[str] = ()) -> None:
+        """Raise OptionError for a name given at start that no node has: ROS passes over it."""
         given = getattr(self._node, '_parameter_overrides', {})  # rclpy has no other access to it
-        for name in sorted(given):
-            if name not in self._fields and not options.is_of_ros(name):
-                raise OptionError(options.unknown_option(name, self._fields))
+        if why := self.why_unknown(name for name in sorted(given) if name not in of_others):
+            raise OptionError(why)
+
+    def why_unknown(self, names: Iterable[str]) -> str:
+        """One line for the first name that no option has, nor each ROS node; empty if none."""
+        unknown = (n for n in names if n not in self._fields and not options.is_of_ros(n))
+        return next((options.unknown_option(name, self._fields) for name in unknown), '')
 
     def _on_set(self, parameters: list[Parameter]) -> SetParametersResult:
         for parameter in parameters:

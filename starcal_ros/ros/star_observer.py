@@ -34,6 +34,7 @@ from starcal_ros.ros.node import Health, make_message, OK, run, StarcalNode, WAR
 from starcal_ros.sky.attitude import attitude_sample
 from starcal_ros.sky.velocity import doubt_of
 from starcal_ros.text import counted
+from starcal_ros.untrusted import shown
 
 NAME = 'star_observer'
 _ATTITUDES = (QuaternionStamped, PoseStamped, TransformStamped, Imu)
@@ -274,6 +275,9 @@ class StarObserver(StarcalNode):
         prior = self._setup.prior.camera
         if (geometry.camera.width, geometry.camera.height) != (prior.width, prior.height):
             raise ValueError('calibration: image size differs from the prior camera')
+        named, frames = (calibration.child_frame, calibration.parent_frame), self._setup.frames
+        if named != (own := (frames.camera_frame, frames.star_tracker_frame)):
+            raise ValueError(f'calibration: frames {shown(named)}, not {own}')
         self._camera_info = record_messages.camera_info_to_message(calibration, make_message)
         self._withdrawn = ''
         self._in_worker(self._predict_with, geometry, calibration.number)

@@ -45,7 +45,7 @@ class CalibratorState:
 
     Both are frozen records: a solve works on the ensemble it began with while the next grows.
     With a state folder both are on disk before they are published; while the disk fails they are
-    in memory, `trouble` has the cause, and `save` tries again.
+    in memory, `trouble` has the cause, `on_trouble` is told each change, and `save` tries again.
 
     Parameters
     ----------
@@ -53,8 +53,10 @@ class CalibratorState:
         The time, read at the moment of an activation: a solve may take minutes.
     """
 
-    def __init__(self, now_ns: Callable[[], int]) -> None:
-        self._now_ns = now_ns
+    def __init__(
+        self, now_ns: Callable[[], int], on_trouble: Callable[[str], None] = lambda _: None
+    ) -> None:
+        self._now_ns, self._on_trouble = now_ns, on_trouble
         self.trouble = ''  # why the last attempt to save failed
         self.damage: tuple[str, ...] = ()  # files found damaged when the folder was read
         # By number: why the gate of today refuses the last calibrations.
@@ -71,7 +73,7 @@ class CalibratorState:
         self._disk = threading.Lock()  # guards the archive
         self._archive: Archive | None = None
         self._folder = ''
-        self._camera: tuple[int, int, str] = (0, 0, '')  # camera of the records in memory
+        self._camera = (0, 0, '', '')  # camera of the records in memory
         self._on_disk = Kept()  # last written
 
     def open(self, setup: Setup, options: CalibratorOptions) -> None:
@@ -79,10 +81,10 @@ class CalibratorState:
         Join the records in memory with those of the state folder; without one, continue with them.
 
         The later activation is active, and nothing is dropped but by `reset`: images of another
-        size in the folder are set aside and counted. Records in memory of another camera stay in
-        their folder; where they are in none, they raise OptionError, as does a folder of another
-        camera. Raises ArchiveError when the folder, or its key, cannot be used. Memory and folder
-        are then as before.
+        size in the folder are set aside and counted. Records in memory of another camera (size or
+        frames) stay in their folder; where they are in none, they raise OptionError, as does a
+        folder of another camera. Raises ArchiveError when the folder, or its key, cannot be used.
+        Memory and folder are then as before.
 
         The last calibration is judged by the gate with the present setup before it is active.
         Where it is refused, the one that a roll-back would return to is judged, and so on; refused
@@ -97,7 +99,7 @@ class CalibratorState:
                     folder = Kept(
                         archive.read_ensemble(), archive.read_history(), archive.collections
                     )
-                    _check_camera(options.state_dir, folder, archive, memory, setup)
+                    _check_camera(options.state_dir, folder, archive.frames, setup)
                     folder = replace(folder, ensemble=_of_size(folder.ensemble, archive, setup))
                     kept = joined(folder, memory, archive.last_event)
                     if memory:
@@ -127,8 +129,8 @@ class CalibratorState:
         nothing = Kept(collections=replace(self._collections, current=()))
         if not memory:
             return nothing, ''
-        width, height, frame = self._camera
-        of_camera = f'{memory} are of a camera of {width} x {height} in {frame}'
+        width, height, *frames = self._camera
+        of_camera = f'{memory} are of a camera of {width} x {height}, {" in ".join(frames)}'
         if self._folder and memory == self._on_disk:
             return nothing, f'{of_camera}: they stay in {self._folder}'
         raise errors.OptionError(
@@ -327,14 +329,24 @@ class CalibratorState:
         with self._records:
             kept = Kept(self._ensemble, self._history, self._collections)
             active, withdrawn = self._active, self._withdrawn()
+        trouble = ''
         try:
             self._archive.keep(kept.ensemble, kept.history, kept.collections)
             self._archive.keep_active(active, withdrawn)
-            self._on_disk, self.trouble = kept, ''
+            self._on_disk = kept
         except errors.ArchiveError as error:
-            self.trouble = str(error)
+            trouble = str(error)
         except Exception as error:  # whatever it is, the records are not on disk
-            self.trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
+            trouble = f'{type(error).__name__}: {" ".join(str(error).split())}'
+        if trouble != self.trouble:
+            self.trouble = trouble
+            self._on_trouble(trouble)
+
+    @property
+    def is_unsaved(self) -> bool:
+        """True if the last attempt to save failed, or the folder was replaced since."""
+        with self._disk:
+            return bool(self.trouble or (self._archive and not self._archive.is_in_place()))
 
     def disk_free_bytes(self) -> int | None:
         """Free space for the state folder; None without one."""
@@ -370,8 +382,9 @@ class CalibratorState:
         return replace(answer, calibration=active, active=True)
 
     def _answer(self, message: str) -> Answer:
-        unsaved = f'; not on disk: {self.trouble}' if self.trouble else ''
-        return Answer(True, message + unsaved)
+        # First: an answer of a service is cut at its end.
+        unsaved = f'not on disk: {self.trouble}; ' if self.trouble else ''
+        return Answer(True, unsaved + message)
 
 
 def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str, ...]:
@@ -386,6 +399,9 @@ def refusals_today(calibration: records.Calibration, setup: Setup) -> tuple[str,
     if (camera.width, camera.height) != (prior.width, prior.height):
         size = f'it is of a camera of {camera.width} x {camera.height}'
         return (f'{size}, the prior camera has {prior.width} x {prior.height}',)
+    frames, own = (calibration.child_frame, calibration.parent_frame), _camera_of(setup)[2:]
+    if frames != own:
+        return (f'it is of {" in ".join(frames)}, the parameters of {" in ".join(own)}',)
     if not (calibration.accepted or calibration.forced):
         return ('its file states that the gate refused it', *calibration.reasons)
     try:
@@ -414,34 +430,29 @@ def summary(calibration: records.Calibration) -> str:
     return '; '.join([fit, *requirement_answers(calibration)])
 
 
-def _camera_of(setup: Setup) -> tuple[int, int, str]:
-    """Size and frame: cameras with one sensor differ by their frame."""
-    camera = setup.prior.camera
-    return camera.width, camera.height, setup.frames.camera_frame
+def _camera_of(setup: Setup) -> tuple[int, int, str, str]:
+    """Size and frames: cameras with one sensor differ by their frames."""
+    camera, frames = setup.prior.camera, setup.frames
+    return camera.width, camera.height, frames.camera_frame, frames.star_tracker_frame
 
 
-def _check_camera(
-    state_dir: str, folder: Kept, archive: Archive, memory: Kept, setup: Setup
-) -> None:
-    """Raise OptionError where a folder is of another camera than the setup or the memory."""
-    prior = setup.prior.camera
-    cameras = [record.calibration.geometry.camera for record in folder.history]
-    sizes = {(one.width, one.height) for one in cameras}
+def _check_camera(state_dir: str, folder: Kept, frames: tuple[str, str], setup: Setup) -> None:
+    """Raise OptionError where a folder, with images of these frames, is of another camera."""
+    given = _camera_of(setup)
+    calibrations = [record.calibration for record in folder.history]
+    sizes = {(one.geometry.camera.width, one.geometry.camera.height) for one in calibrations}
     sizes |= {(one.width, one.height) for one in folder.ensemble.images}
-    if sizes and (prior.width, prior.height) not in sizes:
-        width, height = min(sizes)
-        raise errors.OptionError(
-            f'state_dir: {state_dir} is of a camera of {width} x {height}, '
-            f'the prior camera has {prior.width} x {prior.height}: choose another folder'
-        )
-    # A folder alone may be of a frame that has another name since.
-    frame, known = setup.frames.camera_frame, set(folder.collections.current)
-    is_related = not known.isdisjoint(memory.collections.current)
-    if memory and folder and archive.camera_frame not in ('', frame) and not is_related:
-        raise errors.OptionError(
-            f'state_dir: {state_dir} is of the camera {archive.camera_frame}, {memory} in memory '
-            f'are of {frame}: choose another folder'
-        )
+    pairs = (frames, *((one.child_frame, one.parent_frame) for one in calibrations))
+    named = {(camera, tracker or given[3]) for camera, tracker in pairs if camera}
+    for form, stated, own in (
+        ('a camera of {} x {}', sizes, given[:2]),
+        ('camera_frame {} in {}', named, given[2:]),
+    ):
+        if stated and own not in stated:
+            raise errors.OptionError(
+                f'state_dir: {state_dir} is of {form.format(*min(stated))}, the parameters of '
+                f'{form.format(*own)}: choose another folder, or the camera of this one'
+            )
 
 
 def _of_size(
@@ -467,4 +478,5 @@ def _archive_of(setup: Setup, options: CalibratorOptions) -> Archive:
             ' restart loses the ensemble'
         ) from error
     seal = read_seal(options.state_key_file)
-    return Archive(Path(options.state_dir), setup.frames.camera_frame, seal)
+    frames = setup.frames
+    return Archive(Path(options.state_dir), frames.camera_frame, seal, frames.star_tracker_frame)

@@ -72,6 +72,23 @@ def test_another_image_of_a_stamp_on_disk_takes_its_place(tmp_path: Path) -> Non
             assert_same(a, b)
 
 
+def test_what_is_saved_is_in_the_folder_that_is_locked(tmp_path: Path) -> None:
+    """A removed or replaced one has no image; put back, it has the images and takes others."""
+    folder, moved, grown = tmp_path / 'state', tmp_path / 'moved', Ensemble(images()[:2])
+    with opened(folder) as archive:
+        archive.keep(Ensemble(images()[:1]), ())
+        folder.rename(moved)
+        for change in (lambda: None, folder.mkdir):
+            change()
+            assert archive.saved(grown) == 0
+            with pytest.raises(ArchiveError, match='was removed or replaced; put it back'):
+                archive.keep(grown, ())
+        folder.rmdir()
+        moved.rename(folder)
+        archive.keep(grown, ())
+        assert archive.saved(grown) == 2
+
+
 def test_the_ensemble_is_a_bag_and_no_metadata_lacks_an_image(tmp_path: Path) -> None:
     """A description that another program left is removed: all images are read."""
     with opened(tmp_path) as archive:

@@ -21,6 +21,9 @@ from types import SimpleNamespace
 from typing import Any
 
 from geometry_msgs.msg import TransformStamped
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
+from managers import ACTIVATE, DEACTIVATE  # type: ignore[import-not-found]
 import pytest
 from rclpy.parameter import Parameter
 from rclpy.serialization import deserialize_message
@@ -42,7 +45,7 @@ from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
 from starcal_ros.ros.calibrator import Calibrator
-from starcal_ros.ros.node import make_message
+from starcal_ros.ros.node import make_message, OK, WARN
 from starcal_ros.ros.state import Answer
 
 pytestmark = pytest.mark.nodes
@@ -108,6 +111,15 @@ def test_diagnostics_are_of_the_limits_of_today(client: Client, calibrator: Cali
     told = [relaxed[key] for key in ('active', 'last_gate', 'last_answer')]
     assert told == [1, 'accepted', '']
     client.until(lambda: latched[-1].k[0] > 0)
+
+
+def test_a_transition_is_in_the_diagnostics_at_once(calibrator: Calibrator) -> None:
+    service: Any
+    (service,) = (one for one in calibrator.services if one.srv_type is ChangeState)
+    for transition, level in ((DEACTIVATE, WARN), (ACTIVATE, OK)):
+        asked = ChangeState.Request(transition=Transition(id=transition))
+        assert service.callback(asked, ChangeState.Response()).success
+        assert calibrator._level == level
 
 
 def transform(frame: str, x: float) -> TransformStamped:

@@ -48,7 +48,7 @@ def write_state(folder: Path, seal: Seal) -> Path:
         for number, one in ((1, without_field(calibration())), (2, calibration()))
     )
     history = (Activation(1, 0, first), Activation(2, 1, second))
-    with contextlib.closing(Archive(folder, 'camera', seal)) as archive:
+    with contextlib.closing(Archive(folder, 'camera', seal, 'star_tracker')) as archive:
         ensemble = Ensemble(observations()[:2], {'no_stars': 1})
         archive.keep(ensemble, history, Collections().begun())
     return folder

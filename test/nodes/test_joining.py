@@ -62,6 +62,8 @@ damaged event -> none | b a
     open A; activate a; activate b; close; cut A/calibrations/*2.json; open A
 removed folder -> 0 1 | a
     open A; images 0 1; activate a; close; remove A; open A
+folder removed in use -> 0 1 | b a
+    open A; images 0; activate a; remove A; images 1; activate b; open A
 reset -> 3 | none
     open A; images 0 1; reset; images 3
 # A reset is an event of the images: they do not come back from anywhere.
@@ -127,11 +129,11 @@ def test_the_limit_of_images_holds(calibrators: Calibrators) -> None:
 
 # How the last step fails; before it, P1 holds images 0 and 1 and calibration m.
 UNJOINED = scripts(r"""
-of another camera -> 2 images and 1 activation are of .* in camera, and not on disk: configure
+of another camera -> 2 images and 1 activation are of .*, camera in star_tracker, and not on disk:
     open -; images 0 1; activate m; camera navcam_2; open A
 not saved of another -> and not on disk: configure with that camera and a state_dir that can be
     open A; images 0; full; images 1; activate m; close; room; camera navcam_2; open -
-a folder of another -> A is of the camera navcam_1, 2 images and 1 activation in memory are of .*:
+a folder of another -> A is of camera_frame navcam_1 in star_tracker, the parameters of camera_fr
     camera navcam_1; P2 open A; P2 images 2; P2 close; camera camera;
     open -; images 0 1; activate m; open A
 in use -> in use by another calibrator

@@ -311,7 +311,7 @@ def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
     for info in infos:
         expected.header = info.header
         assert info == expected
-    forced = dataclasses.replace(candidate, forced=True, child_frame='elsewhere')
+    forced = dataclasses.replace(candidate, forced=True)
     calibrations.publish(calibration_to_message(forced, make_message))
     vehicle.until(lambda: observer.said().count('predicting stars') == 2)
     header = show(8)
@@ -330,14 +330,17 @@ def test_calibrator_collects_while_it_solves(vehicle: Vehicle) -> None:
     vehicle.until(solve.service_is_ready)
     futures = [solve.call_async(Calibrate.Request(dry_run=True)) for _ in range(5)]
     observations.publish(StarObservations(catalog_id=[1, 2], snr=[1.0]))
+    of_other = dataclasses.replace(tiny_observations().images[0], time_ns=1)
+    observations.publish(observations_to_message(of_other, 'right_camera', make_message))
     for k in range(300):
         refused = refused_image(k, 8, 8, 'no_stars', '')
         observations.publish(observations_to_message(refused, '', make_message))
     vehicle.until(lambda: all(future.done() for future in futures))
     assert all(future.result().success for future in futures)
-    expected, told = [('bad_observations', 1), ('no_stars', 300)], vehicle.statuses()
+    expected, told = [('bad_observations', 2), ('no_stars', 300)], vehicle.statuses()
     vehicle.until(lambda: [(one.reason, one.count) for one in told[-1].refused] == expected)
     assert 'direction_icrf: 0 numbers, not 2 x 3' in calibrator.said()
+    assert "header.frame_id: 'right_camera' is not camera, camera_frame" in calibrator.said()
     assert 'Traceback' not in calibrator.said()
 
 
@@ -364,8 +367,13 @@ OBSERVER, CALIBRATOR = BOTH
         (OBSERVER, lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
         (CALIBRATOR, broken_file, 'params.yaml'),
         ('bag_player', lambda *_: (), 'bag: path of the bag to play is missing'),
-        ('bag_player', lambda *_: ('-p', 'bag:=/no/bag'), '/no/bag: no such file or folder'),
+        ('bag_player', lambda f, _: parameters(f, 'bag:=/no/bag'), '/no/bag: no such file or fol'),
         ('bag_player', lambda *_: ('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
+        (
+            'bag_player',
+            lambda *_: ('-p', 'bagg:=x'),
+            'bagg: no such parameter (did you mean bag?)',
+        ),
     ],
 )
 def test_bad_parameters(
@@ -402,14 +410,21 @@ def test_parameters_while_running(vehicle: Vehicle) -> None:
     assert set_gap(vehicle, 1.0) == ''
     assert 'max_attitude_gap_s' in set_gap(vehicle, -1.0)
     assert 'Type' in set_gap(vehicle, 1.0, 41)
+    known = '(did you mean max_attitude_gap_s?)'
+    assert known in set_gap(vehicle, 1.0, name='max_atitude_gap_s')
     assert manager.change(CONFIGURE) and manager.change(ACTIVATE)
     assert node.process.poll() is None
 
 
-def set_gap(client: Client, value: float, kind: int = ParameterType.PARAMETER_DOUBLE) -> str:
+def set_gap(
+    client: Client,
+    value: float,
+    kind: int = ParameterType.PARAMETER_DOUBLE,
+    name: str = 'max_attitude_gap_s',
+) -> str:
     """Set a parameter; return the reason of a refusal, '' if accepted."""
     number = ParameterValue(type=kind, double_value=value)
-    parameter = Parameter(name='max_attitude_gap_s', value=number)
+    parameter = Parameter(name=name, value=number)
     answer = client.call(SetParameters, '/star_observer/set_parameters', parameters=[parameter])
     return '' if answer.results[0].successful else str(answer.results[0].reason)
 

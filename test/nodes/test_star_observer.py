@@ -8,6 +8,7 @@ As a process with two star trackers, of which the first falls silent.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 import threading
 from typing import Any
@@ -62,6 +63,15 @@ def test_the_worker_alone_changes_prediction_and_counts(
     go_on.set()
     assert done.wait(240.0)
     assert observer._geometry is not prior
+
+
+@pytest.mark.parametrize('changed', [{'child_frame': 'other'}, {'parent_frame': 'other'}])
+def test_a_calibration_of_other_frames_is_not_used(
+    observer: StarObserver, tiny_products: Path, changed: Any
+) -> None:
+    other = replace(read_calibration(tiny_products / CALIBRATION_FILE), **changed)
+    with pytest.raises(ValueError, match="'other'.*, not .'camera', 'star_tracker'"):
+        observer._on_calibration(calibration_to_message(other, make_message))
 
 
 def test_the_first_image_awaits_a_velocity_that_has_a_publisher(

@@ -9,6 +9,7 @@ import itertools
 import json
 from pathlib import Path
 import re
+import shutil
 from typing import Any
 
 from attacks import bag_setup, observations  # type: ignore[import-not-found]
@@ -108,22 +109,35 @@ def test_the_first_of_a_stamp_stands_in_memory_and_on_disk(tmp_path: Path) -> No
 
 
 def test_a_full_disk_costs_nothing_that_memory_holds(tmp_path: Path) -> None:
-    state = filled(observations()[:-1], tmp_path)
+    state, told = filled(observations()[:-1], tmp_path), list[str]()
+    state._on_trouble = told.append
     with full_disk():
         state.add(observations()[-1])
         answer = state.solve()
         status = state.status()
-    assert answer.success and 'not on disk: state_dir:' in answer.message
+    assert answer.success and answer.message.startswith('not on disk: state_dir:')
+    assert told[0].startswith('state_dir:') and told[-1] == state.trouble
     assert (status.images, status.images_saved) == (len(observations()), len(observations()) - 1)
     assert 'cannot be written: File too large' in state.trouble
     assert (state.disk_free_bytes() or 0) > 0
     # The folder is let go of and taken up again before the disk has room: nothing is lost.
     state.close()
     state.open(bag_setup(), CalibratorOptions(state_dir=str(tmp_path)))
-    assert state.trouble == '' and state.status().images_saved == len(observations())
+    assert state.trouble == told[-1] == '' and '' not in told[:-1]
+    assert state.status().images_saved == len(observations())
     state.close()
     state = started(tmp_path)
     assert len(state.ensemble.images) == len(observations()) and state.active is not None
+    state.close()
+
+
+def test_a_removed_folder_is_noticed_without_an_image(tmp_path: Path) -> None:
+    state = filled(observations()[:1], tmp_path / 'A')
+    assert not state.is_unsaved
+    shutil.rmtree(tmp_path / 'A')
+    assert state.is_unsaved and state.status().images_saved == 0
+    state.save()
+    assert 'was removed or replaced' in state.trouble
     state.close()
 
 
@@ -157,6 +171,34 @@ def test_a_folder_of_another_camera_is_refused(tmp_path: Path) -> None:
     with pytest.raises(OptionError, match=f'state_dir: {tmp_path / "state"} is of a camera of'):
         started(tmp_path / 'state', other)
     started(tmp_path / 'state').close()  # it was let go of
+
+
+@pytest.mark.parametrize('step', ['images 0', 'activate a'])
+@pytest.mark.parametrize('frames', ['navcam_2 star_tracker', 'camera star_tracker_2'])
+def test_a_folder_of_other_frames_is_refused_and_stays(
+    calibrators: Calibrators, step: str, frames: str
+) -> None:
+    """By a process that holds nothing too, whose calibration would be that of another camera."""
+    calibrators.run(f'open A; {step}; kill')
+    content = {path: path.read_bytes() for path in calibrators.disk.glob('A/*/*')}
+    words = (
+        f'camera in star_tracker, the parameters of camera_frame {frames.replace(" ", " in ")}:'
+    )
+    with pytest.raises(OptionError, match=words):
+        calibrators.run(f'camera {frames}; open A')
+    assert content == {path: path.read_bytes() for path in calibrators.disk.glob('A/*/*')} != {}
+    calibrators.run('camera camera; open A')
+
+
+def test_one_calibration_of_other_frames_is_not_active(calibrators: Calibrators) -> None:
+    calibrators.run('open A; activate a; activate b; kill')
+    (path,) = calibrators.disk.glob('A/calibrations/*2.json')
+    content = CHECKSUMS.opened(path.read_bytes())
+    of_other = {**content, 'alignment': {**content['alignment'], 'child': 'other'}}
+    path.write_text(CHECKSUMS.sealed(of_other))
+    state = calibrators.run('open A')
+    assert 'it is of other in star_tracker, the parameters of camera in' in state.withheld[2]
+    assert state.active is not None and state.active.weakest_direction == 'a'
 
 
 @pytest.mark.slow

@@ -25,6 +25,7 @@ from starcal_ros.records import (
     EnsembleStatus,
     StarObservations,
 )
+from starcal_ros.untrusted import shown
 
 _VARIANCE_PX2 = (1e-10, 1e6)  # smallest and largest that a measured star has
 _LONGEST_DETAIL = 500  # characters
@@ -92,13 +93,18 @@ def _forget_zeros(values: dict[str, Any]) -> None:
     values['velocity_sigma_m_s'] = stated.get(velocity, velocity)
 
 
-def checked_observations(message: codec.Message) -> StarObservations:
+def checked_observations(message: codec.Message, camera_frame: str = '') -> StarObservations:
     """
-    Observations of a starcal/StarObservations, refused where they hold impossible values.
+    Observations of a starcal/StarObservations, refused if impossible or of another camera.
 
     The refusal is ``bad_observations``, with the field and its value.
     """
     try:
+        frame = message.header.frame_id
+        if camera_frame and frame not in ('', camera_frame):
+            raise ValueError(
+                f'header.frame_id: {shown(frame)} is not {camera_frame}, camera_frame'
+            )
         return observations_from_message(message)
     except ValueError as error:
         detail = ' '.join(str(error).split())[:_LONGEST_DETAIL]
@@ -107,6 +113,11 @@ def checked_observations(message: codec.Message) -> StarObservations:
 
 def _check_stars(record: StarObservations) -> None:
     """Raise ValueError for values of one field that those of another exclude."""
+    if not (len(record) or record.refusal):
+        raise ValueError('refusal: empty, but the image has no stars')
+    stars, times = np.unique(record.catalog_id, return_counts=True)
+    if (times > 1).any():
+        raise ValueError(f'catalog_id: {int(stars[times.argmax()])} is given twice')
     reasons = len(record.refused_stars)
     if (record.refused_reason >= reasons).any():
         raise ValueError(

@@ -201,6 +201,7 @@ def first(column: str, value: float) -> Any:
             first('direction_icrf', 0.0),
             r'direction_icrf\[0\]: length 0.785404 is not 1',
         ),
+        ('catalog_id', np.full(len(observations()), 7), 'catalog_id: 7 is given twice'),
         ('snr', first('snr', np.inf), r'snr\[0\]: inf is not a finite number'),
         ('refused_star_px', np.full(8, np.inf), r'refused_star_px\[0\]\[0\]: inf is not a finite'),
         ('refused_star_counts', np.zeros(1, np.uint32), '.*: 2 reasons but 1 counts'),
@@ -222,6 +223,15 @@ def test_a_value_that_no_image_has_is_refused(place: str, value: Any, text: str)
     # The refusal itself can be published and saved.
     back = observations_from_message(observations_to_message(record, 'cam', make_message))
     assert_same(record, back)
+
+
+@pytest.mark.parametrize('refusal', ['', 'too_few_stars'])
+def test_an_image_without_stars_states_why(refusal: str) -> None:
+    empty = observations().select(np.zeros(len(observations()), np.bool_))
+    record = dataclasses.replace(empty, refusal=refusal)
+    found = checked_observations(observations_to_message(record, 'cam', plain))
+    assert found.refusal == (refusal or 'bad_observations')
+    assert bool(refusal) or found.detail == 'refusal: empty, but the image has no stars'
 
 
 def test_a_long_detail_is_cut() -> None:
