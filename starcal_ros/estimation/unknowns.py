@@ -28,6 +28,7 @@ import math
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import eval_jacobi
 
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
@@ -641,8 +642,7 @@ def _next_lens_term(width: int, height: int) -> Floats:
     at = np.stack(np.meshgrid(*(np.linspace(-1.0, 1.0, n) for n in (41, 41)), indexing='ij'))
     from_centre = at.reshape(2, -1).T * np.array([width, height]) / math.hypot(width, height)
     r2 = (from_centre**2).sum(axis=1, keepdims=True)
-    radial = (((126.0 * r2 - 280.0) * r2 + 210.0) * r2 - 60.0) * r2 + 5.0
-    term = from_centre * radial
+    term = from_centre * eval_jacobi(4, 0.0, 1.0, 2.0 * r2 - 1.0)  # R_9^1 over r
     term /= np.sqrt((term**2).mean())
     pixels = (at.reshape(2, -1).T + 1.0) / 2.0 * np.array([width, height]) - 0.5
     phi = basis(pixels, width, height, FIELD_OCTAVES)
