@@ -21,12 +21,17 @@ from starcal_ros.assessment.gate import GateOptions
 from starcal_ros.assessment.lookup import GRID
 from starcal_ros.assessment.predictions import predictions
 from starcal_ros.camera import CameraModel, pixel_grid
-from starcal_ros.estimation.calibrate import Estimate
+from starcal_ros.constants import ARCSECOND_RAD
+from starcal_ros.estimation.amplitudes import LogPrior
+from starcal_ros.estimation.calibrate import Estimate, LENS_RESIDUAL_LOG_SIGMA
 from starcal_ros.estimation.limits import FREE_FACTOR
+from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
 from starcal_ros.estimation.posterior import without_prior
 from starcal_ros.estimation.shared_errors import coarsest_cell_px
+from starcal_ros.estimation.tracker_errors import STATED_NOISE, STATED_SLOW
 from starcal_ros.estimation.unknowns import CHANGE, Layout, Unknown
 from starcal_ros.records import Amplitude, DetectorStep, HeldTerm, ModelChecks, StatementCheck
+from starcal_ros.text import significant
 
 _STEPS = 5  # places in the width of a strip: a step between two loses a tenth of its size
 _MARGIN = 0.1  # ends of a side, as a share of it: lenses leave 0.25 px there that look like steps
@@ -46,6 +51,36 @@ def model_checks(estimate: Estimate, statements: tuple[StatementCheck, ...] = ()
         predictions=predictions(estimate),
         statements=statements,
     )
+
+
+def check_sigmas(estimate: Estimate, options: CalibrationOptions) -> tuple[StatementCheck, ...]:
+    """
+    Return the stated sigmas that their estimates contradict, by the prior of the estimate.
+
+    The calibration holds without them, so nothing is refused for them.
+    """
+    trackers = [] if options.method == 'single' else estimate.attitudes.trackers
+    noise = [(t.sigma_rad / ARCSECOND_RAD, t.noise) for t in trackers]
+    slow = options.star_tracker_slow_arcsec
+    lens, lens_px = options.lens_residual_px, math.exp(estimate.posterior.field.log_px[0])
+    sigmas = [
+        *[
+            ('star_tracker_sigma_arcsec', '″', STATED_NOISE, stated, stated * times)
+            for stated, times in noise * tracker_sigma_is_given(options)
+        ],
+        *[
+            ('star_tracker_slow_arcsec', '″', STATED_SLOW, slow, t.slow * sigma)
+            for t, (sigma, _) in zip(trackers, noise, strict=True)
+        ],
+        ('lens_residual_px', ' px', LogPrior(0.0, LENS_RESIDUAL_LOG_SIGMA), lens, lens_px),
+    ]
+    checks = {
+        name: f'{significant(stated, 3)}{unit} stated, {significant(found, 3)}{unit} by the images'
+        ' and so in the sigmas; correct the option, or look for what else moves the images'
+        for name, unit, prior, stated, found in sigmas
+        if stated and prior.is_wrong(np.log(found / stated))
+    }
+    return tuple(StatementCheck(name, None, note) for name, note in checks.items())
 
 
 def _amplitudes(estimate: Estimate) -> tuple[Amplitude, ...]:

@@ -4,8 +4,7 @@ Checks of the statements of an ensemble without stars: velocity, rates, read-out
 
 Each compares a statement with another known quantity.  A statement that nothing contradicts or
 confirms is listed as not checked.  Checks of one value alone are made where it is
-read (`pipeline.setup`); those by the stars are `model_checks`, except that of the sigmas that are
-stated and estimated again: the calibration holds without them, so nothing is refused for them.
+read (`pipeline.setup`); those by the stars are `model_checks`.
 """
 
 from __future__ import annotations
@@ -19,12 +18,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
-from starcal_ros.constants import ARCSECOND_RAD, CLOCKS_SET_NS, NANOSECONDS_PER_SECOND, utc_text
-from starcal_ros.estimation.amplitudes import LogPrior
-from starcal_ros.estimation.calibrate import Estimate, LENS_RESIDUAL_LOG_SIGMA
+from starcal_ros.constants import CLOCKS_SET_NS, NANOSECONDS_PER_SECOND, utc_text
 from starcal_ros.estimation.limits import FEWEST
-from starcal_ros.estimation.options import CalibrationOptions, tracker_sigma_is_given
-from starcal_ros.estimation.tracker_errors import STATED_NOISE, STATED_SLOW
+from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, StarObservations, StatementCheck
 from starcal_ros.sky.astrometry import ESCAPE_M_S
 from starcal_ros.sky.catalog import StarCatalog
@@ -53,32 +49,6 @@ def check_statements(
         *_readout(images, options),
         *_rates(images),
     )
-
-
-def check_sigmas(estimate: Estimate, options: CalibrationOptions) -> tuple[StatementCheck, ...]:
-    """Return the stated sigmas that their estimates contradict, by the prior of the estimate."""
-    trackers = [] if options.method == 'single' else estimate.attitudes.trackers
-    noise = [(t.sigma_rad / ARCSECOND_RAD, t.noise) for t in trackers]
-    slow = options.star_tracker_slow_arcsec
-    lens, lens_px = options.lens_residual_px, math.exp(estimate.posterior.field.log_px[0])
-    sigmas = [
-        *[
-            ('star_tracker_sigma_arcsec', '″', STATED_NOISE, stated, stated * times)
-            for stated, times in noise * tracker_sigma_is_given(options)
-        ],
-        *[
-            ('star_tracker_slow_arcsec', '″', STATED_SLOW, slow, t.slow * sigma)
-            for t, (sigma, _) in zip(trackers, noise, strict=True)
-        ],
-        ('lens_residual_px', ' px', LogPrior(0.0, LENS_RESIDUAL_LOG_SIGMA), lens, lens_px),
-    ]
-    checks = {
-        name: f'{significant(stated, 3)}{unit} stated, {significant(found, 3)}{unit} by the images'
-        ' and so in the sigmas; correct the option, or look for what else moves the images'
-        for name, unit, prior, stated, found in sigmas
-        if stated and prior.is_wrong(np.log(found / stated))
-    }
-    return tuple(StatementCheck(name, None, note) for name, note in checks.items())
 
 
 def with_doubts(ensemble: Ensemble, catalog: StarCatalog) -> Ensemble:

@@ -384,7 +384,7 @@ def chain_means(
     transition, x = _transition(), np.exp(2.0 * _LOG_GRID)
     off = [-0.5 * ((estimate - x) / sigma) ** 2 for estimate, sigma in moments]
     by_pairs = [np.exp(one - one.max()) for one in off]
-    # Of a sum in which one error is large: the likelihood of each, less that of none large.
+    # Where one error is large, the likelihood of the sum is that of each, less that of none large.
     by_excess = _beside_noise(*excess_px2)
     by_excess -= (1.0 - 1.0 / len(moments)) * by_excess[0]
     total, means = 0.0, np.zeros(len(moments))

@@ -38,9 +38,9 @@ _ANGLES_DEG = (10.0, 30.0, 60.0)  # correlation angles: a field of view to a lar
 _LOG_SLOW = np.linspace(-4.5, 4.0, 18)  # ln s, in its prior centre
 _LOG_NOISE = np.linspace(-2.1, 2.8, 15)  # ln n, in the stated sigma; more where errors are larger
 _BEYOND = 1.0  # the grid ends a factor of e above the RMS of the errors at least
-STATED_NOISE = LogPrior(0.0, 0.5)  # of n in the stated sigma: data sheets are right to 1.6
+STATED_NOISE = LogPrior(0.0, 0.5)  # noise in the stated sigma: data sheets are right to 1.6
 _SLOW_SIGMA = 1.25  # prior 1-sigma of ln s; at 0.8 n6_walk is 1.56 sigma off (docs/experiments.md)
-STATED_SLOW = LogPrior(0.0, 0.3)  # of s in a stated star_tracker_slow_arcsec: within 35 %
+STATED_SLOW = LogPrior(0.0, 0.3)  # slow error in the stated one: within 35 %
 _MOST_MEMBERS = 4  # members of a group that give its mean correlation, spread over its time
 
 

@@ -20,8 +20,8 @@ from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment import observability
 from starcal_ros.assessment.budget import sigma_budget, statements
 from starcal_ros.assessment.gate import judge, reasons_of
-from starcal_ros.assessment.model_checks import model_checks
-from starcal_ros.assessment.stated import check_sigmas, check_statements, with_doubts
+from starcal_ros.assessment.model_checks import check_sigmas, model_checks
+from starcal_ros.assessment.stated import check_statements, with_doubts
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.camera.projection import convert

@@ -17,7 +17,8 @@ from worlds import campaign, estimated, honesty, of_random_pointings, options_of
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions, model_gate, reasons_of
-from starcal_ros.assessment.stated import check_sigmas, check_statements, with_doubts
+from starcal_ros.assessment.model_checks import check_sigmas
+from starcal_ros.assessment.stated import check_statements, with_doubts
 from starcal_ros.constants import SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import Ensemble, HeldTerm, StarObservations, StatementCheck

@@ -96,7 +96,8 @@ FEW_PAIRS = [(1e-4, 3e-4), (2e-4, 3e-4), (0.0, 3e-4)]
     [
         ([(4e-4, 1e-4), (0.0, 1e-4), (3e-5, 4e-5)], (0.0, math.inf), 1e-9, 2.8e-4),
         (FEW_PAIRS, (0.0, math.inf), 1e-9, 1e-6),
-        # The excess is noise or one octave: of a second one that is not, it is a little too much.
+        # The excess is noise or one octave: of two that share it 0.25 of a variance are missing,
+        # and a small one beside a large one has 0.4 too much.
         (FEW_PAIRS, (8e-4, 4e-4), 0.3, 5e-5),
         (FEW_PAIRS, (0.0, 2e-4), 1e-9, 1e-6),
         ([(4e-3, 1e-3), (0.0, 1e-3), (0.0, 1e-3)], (1e-3, 5e-4), 0.5, 5e-4),
