@@ -3,10 +3,10 @@
 Errors of a star tracker: noise of each image, slow errors that images share, angular rates.
 
 The attitude errors that the stars of m images show are the alignment, noise of sigma n and a slow
-error of sigma s with the correlation K between images, in time or in attitude.  The restricted
-likelihood of n and s is evaluated on a grid for each K with the alignment eliminated, and results
-are averaged over the posterior.  A slow error that lasts longer than the campaign shows in no
-scatter: it stays in the sigma of the alignment at the size of its prior.
+error of sigma s with the correlation K between images, in time, in attitude or half in each.  The
+restricted likelihood of n and s is evaluated on a grid for each K with the alignment eliminated,
+and results are averaged over the posterior.  A slow error that lasts longer than the campaign
+shows in no scatter: it stays in the sigma of the alignment at the size of its prior.
 
 The rate of an image is measured by a star tracker with noise, or not at all.  Its error times the
 time of read-out turns the camera from the first row to the last: three unknowns of each image.
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 import math
 
 import numpy as np
@@ -47,7 +48,7 @@ _MOST_MEMBERS = 4  # members of a group that give its mean correlation, spread o
 @dataclass(frozen=True)
 class Correlations:
     """
-    Correlations K (g, g) that slow errors of groups of images may have, in time and in attitude.
+    Correlations K (g, g) that slow errors of groups of images may have: in time, attitude, both.
 
     ``group`` (m,) as for `TrackerErrors`; ``axes`` has the eigenvalues (g,) and the eigenvectors
     (g, g) of each K.
@@ -222,6 +223,9 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     """
     Return the correlations of slow errors of images at these stamps (m,) and attitudes.
 
+    An error changes in time, over the sky, or is the sum of one of each: where one of two shows in
+    a scatter, the other one may hide in the mean.
+
     Images are joined in at most `MOST_CORRELATED` groups of neighbours in time.
     """
     group = groups_of(time_ns)
@@ -250,12 +254,21 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     boresight = camera_from_icrf.as_matrix()[some, 2]
     # Squared chords: a Gaussian of the angle itself is no covariance on a sphere.
     chord2 = 2.0 - 2.0 * boresight @ boresight.T
-    names = [f'over {share * span_s:.3g} s' for share in _SPANS]
-    kernels = [of_groups(np.exp(-apart_s / (share * span_s))) for share in _SPANS]
-    names += [f'over {one:g} deg' for one in _ANGLES_DEG]
-    kernels += [of_groups(np.exp(-0.5 * chord2 / math.radians(one) ** 2)) for one in _ANGLES_DEG]
-    axes = tuple(eigh(K, check_finite=False) for K in kernels)
-    return Correlations(group, tuple(names), np.array(kernels), axes)
+    in_time = {
+        f'over {share * span_s:.3g} s': of_groups(np.exp(-apart_s / (share * span_s)))
+        for share in _SPANS
+    }
+    in_attitude = {
+        f'over {one:g} deg': of_groups(np.exp(-0.5 * chord2 / math.radians(one) ** 2))
+        for one in _ANGLES_DEG
+    }
+    in_both = {
+        f'{time} and {angle}': 0.5 * (in_time[time] + in_attitude[angle])
+        for time, angle in product(in_time, in_attitude)
+    }
+    kernels = in_time | in_attitude | in_both
+    axes = tuple(eigh(K, check_finite=False) for K in kernels.values())
+    return Correlations(group, tuple(kernels), np.array(list(kernels.values())), axes)
 
 
 def _restricted(
