@@ -100,11 +100,13 @@ class Amplitudes:
     """
     Amplitudes at the maximum of their posterior.
 
-    ``log_px`` (g,); ``likelihood_ratio``: twice the log likelihood against none of them.
+    ``log_px`` (g,); ``likelihood_ratio``: twice the log likelihood against none of them; ``other``
+    (g,): a lower maximum that the search has found too.
     """
 
     log_px: Floats
     likelihood_ratio: float
+    other: Floats | None = None
 
 
 @dataclass(frozen=True)
@@ -150,7 +152,7 @@ def field_amplitudes(
         On the coefficients, scaled to a prior of 1 px for each octave, all else eliminated.
     octave : (q,)
     near : Amplitudes, optional
-        Amplitudes of the round before: the search starts there and from one other place.
+        Amplitudes of the round before: the search starts there and from its other maximum.
     first : LogPrior
         Prior of the first octave.
     """
@@ -160,7 +162,7 @@ def field_amplitudes(
     starts_px = STARTS_PX[0], STARTS_PX[3]
     starts = [math.log(one) - 0.3 * np.arange(count, dtype=np.float64) for one in starts_px]
     if near is not None:
-        starts = [near.log_px, starts[-1]]
+        starts = [near.log_px, starts[-1] if near.other is None else near.other]
     member = np.equal.outer(np.arange(count), octave).astype(float)
     cap = math.log(LARGEST_FIELD_PX)
 
@@ -181,7 +183,7 @@ def field_amplitudes(
         fisher = 2.0 * own @ (resolved * resolved.T) @ own.T + precision
         return float(value - 0.5 * off @ precision @ off), slope, fisher
 
-    best, best_value = mean, -np.inf
+    maxima: list[tuple[float, Floats]] = []
     for log_px in starts:
         value, slope, fisher = evaluate(log_px)
         for _ in range(MOST_ROUNDS):
@@ -197,10 +199,12 @@ def field_amplitudes(
                     break
             if abs(value - before) < LEAST_GAIN:
                 break
-        if value > best_value + 1e-6:
-            best, best_value = log_px, value
-    ratio = best_value + 0.5 * (best - mean) @ precision @ (best - mean)
-    return Amplitudes(best, 2.0 * float(ratio))
+        maxima.append((value, log_px))
+    (value, best), (_, other) = sorted(maxima, key=lambda one: one[0], reverse=True)
+    ratio = value + 0.5 * (best - mean) @ precision @ (best - mean)
+    # The octaves of one maximum differ by less than the prior lets them.
+    is_lower = bool(np.abs(best - other).max() > OCTAVE_SIGMA)
+    return Amplitudes(best, 2.0 * float(ratio), other if is_lower else None)
 
 
 def _cholesky_and_inverse(matrix: Floats) -> tuple[Floats, Floats]:
@@ -355,6 +359,8 @@ def interval_factor(sigma: Floats, weight: Floats) -> float:
     Errors of an uncertain sigma have long tails, as Student's t has: few images determine no
     variance.  A normal error of this sigma has the same 2-sigma interval.
     """
+    shown = weight > ROUNDING * weight.max()
+    sigma, weight = sigma[shown], weight[shown]
 
     def beyond(log_half: float) -> float:
         inside = weight @ erf(math.sqrt(2.0) * math.exp(log_half) / sigma) / weight.sum()
@@ -499,27 +505,29 @@ def _common_part(sums: ShapeSums, sigma_px: Floats) -> Floats:
         steps = np.maximum(steps, apart_s / _STEP_S)
     K = _PER_STEP**steps
     ratio = (K.sum() - len(K)) / (len(K) ** 2 - K.sum())
-    common_px2 = np.empty(len(sigma_px))
-    for k in range(len(sigma_px)):  # the shapes in units of their noise
-        values, vectors = np.linalg.eigh(K * np.outer(root[:, k], root[:, k]))
-        along = left[:, k] / root[:, k]
-        correlated = _evidence(values, root[:, k] @ vectors, along @ vectors)
-        alone = _evidence(information[used, k], root[:, k], along)
-        common_px2[k] = ratio * expit(correlated - alone) * sigma_px[k] ** 2
-    return common_px2
+    # The shapes, one after the other, in units of their noise.
+    values, vectors = np.linalg.eigh(K * root.T[:, :, None] * root.T[:, None, :])
+    along = left / root
+    of_ones = np.einsum('ms,sma->sa', root, vectors)
+    correlated = _evidence(values, of_ones, np.einsum('ms,sma->sa', along, vectors))
+    alone = _evidence(information[used].T, root.T, along.T)
+    return np.asarray(ratio * expit(correlated - alone) * sigma_px**2)
 
 
-def _evidence(values: Floats, ones: Floats, along: Floats) -> float:
+def _evidence(values: Floats, ones: Floats, along: Floats) -> Floats:
     """
-    Return the log evidence of shapes along the axes of their covariance, mean eliminated.
+    Return the log evidence (s,) of shapes along the axes of their covariance, mean eliminated.
 
-    Along each axis (m,): variance at an amplitude of 1 px, component of a common shape, and of
+    Along each axis (s, m): variance at an amplitude of 1 px, component of a common shape, and of
     the shapes.
     """
     log_px = log_amplitudes(LARGEST_SHAPE_PX)
-    inverse = 1.0 / (1.0 + np.exp(2.0 * log_px)[:, None] * np.maximum(values, 0.0))
-    of_ones, mean = inverse @ ones**2, inverse @ (ones * along)
-    squared = inverse @ along**2 - mean**2 / of_ones
-    log_det = np.log(of_ones) - np.log(inverse).sum(axis=1)
+    size2 = np.exp(2.0 * log_px)[:, None]
+    inverse = 1.0 / (1.0 + size2 * np.maximum(values, 0.0)[:, None, :])
+    of_ones, mean, squared = (
+        (inverse @ one[:, :, None])[:, :, 0] for one in (ones**2, ones * along, along**2)
+    )
+    log_det = np.log(of_ones) - np.log(inverse).sum(axis=2)
     prior = LogPrior().log_density(log_px)
-    return float(np.logaddexp.reduce(prior - 0.5 * (log_det + squared)))
+    posterior = prior - 0.5 * (log_det + squared - mean**2 / of_ones)
+    return np.asarray(np.logaddexp.reduce(posterior, axis=1))
