@@ -51,12 +51,13 @@ class Correlations:
     Correlations K (g, g) that slow errors of groups of images may have: in time, attitude, both.
 
     ``group`` (m,) as for `TrackerErrors`; ``axes`` has the eigenvalues (g,) and the eigenvectors
-    (g, g) of each K.
+    (g, g) of each K; ``weight`` (k,) is the prior probability of each.
     """
 
     group: Indices
     names: tuple[str, ...]
     kernels: Floats  # (k, g, g)
+    weight: Floats
     axes: tuple[tuple[Floats, Floats], ...]
 
 
@@ -144,8 +145,9 @@ def tracker_errors(
     prior = noise_prior + slow_prior.log_density(_LOG_SLOW[:, None])
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
     within = float(((error - of_group[group]) ** 2).sum())
-    log_weight, mean_information = [], []
+    log_likelihood, mean_information = [], []
     plain = -math.inf
+    log_share = np.log(correlations.weight)[:, None, None]
     for K, axes in zip(correlations.kernels, correlations.axes, strict=True):
         likelihood, information = _restricted(*axes, of_group, slow2, noise2, of_stars, m / len(K))
         # Within a group there is noise, and the slow error that its members do not share.
@@ -153,10 +155,11 @@ def tracker_errors(
             apart = m / (m - len(K)) * (1.0 - float(size @ np.diag(K)) / m)
             alone = slow2 * max(apart, 0.0) + noise2 + of_stars
             likelihood = likelihood - 0.5 * (count * (m - len(K)) * np.log(alone) + within / alone)
-        log_weight.append(likelihood + prior)
+        log_likelihood.append(likelihood)
         mean_information.append(information)
         plain = max(plain, float(likelihood[0].max()))
-    weight = np.exp(np.array(log_weight) - np.max(log_weight))
+    by_prior = np.array(log_likelihood) + prior + log_share
+    weight = np.exp(by_prior - by_prior.max())
     weight /= weight.sum()
     noise = float(weight.sum(axis=(0, 1)) @ noise2)
     of_mean = interval_factor(np.array(mean_information).ravel() ** -0.5, weight.ravel())
@@ -168,7 +171,7 @@ def tracker_errors(
     shrunk = min(of_mean**2 / mean_variance, 1.0)
     covariance *= shrunk
     best = int(np.argmax(weight.sum(axis=(1, 2))))
-    ratio = max(float(one.max()) for one in (w - prior for w in log_weight)) - plain
+    ratio = float(np.max(log_likelihood)) - plain
     return TrackerErrors(
         noise=math.sqrt(noise),
         slow=math.sqrt(float(per_kernel.sum())),
@@ -207,7 +210,7 @@ def expected_slow_of_mean(correlations: Correlations, stated_slow: float, noise:
     """
     log_sigma = STATED_SLOW.sigma if stated_slow else _SLOW_SIGMA
     size = np.bincount(correlations.group) / len(correlations.group)
-    shared = float((size @ correlations.kernels @ size).mean())
+    shared = float(correlations.weight @ (size @ correlations.kernels @ size))
     return (stated_slow or noise) * math.exp(0.5 * log_sigma**2) * math.sqrt(shared)
 
 
@@ -224,7 +227,8 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     Return the correlations of slow errors of images at these stamps (m,) and attitudes.
 
     An error changes in time, over the sky, or is the sum of one of each: where one of two shows in
-    a scatter, the other one may hide in the mean.
+    a scatter, the other one may hide in the mean.  All sums together are as likely as any one
+    error alone.
 
     Images are joined in at most `MOST_CORRELATED` groups of neighbours in time.
     """
@@ -268,7 +272,9 @@ def correlations_of(time_ns: Indices, camera_from_icrf: Rotation) -> Correlation
     }
     kernels = in_time | in_attitude | in_both
     axes = tuple(eigh(K, check_finite=False) for K in kernels.values())
-    return Correlations(group, tuple(kernels), np.array(list(kernels.values())), axes)
+    weight = np.repeat([1.0, 1.0 / len(in_both)], [len(kernels) - len(in_both), len(in_both)])
+    weight /= weight.sum()
+    return Correlations(group, tuple(kernels), np.array(list(kernels.values())), weight, axes)
 
 
 def _restricted(

@@ -163,7 +163,7 @@ def test_a_statement_is_confirmed_contradicted_or_listed_as_not_checked(
     [
         ({}, ''),  # 20 arcsec, as it is
         ({'star_tracker_sigma_arcsec': (5.0, 5.0, 5.0)}, ''),
-        ({'star_tracker_sigma_arcsec': (0.1, 0.1, 0.1)}, '0.1″ stated, 15.9″'),
+        ({'star_tracker_sigma_arcsec': (0.1, 0.1, 0.1)}, '0.1″ stated, 16.4″'),
         ({'star_tracker_slow_arcsec': 1000.0}, '1000″ stated, '),
         ({'lens_residual_px': 0.5}, '0.5 px stated, 0.00'),
         ({'star_tracker_sigma_arcsec': (0.1, 0.1, 0.1), 'method': 'single'}, ''),  # exact
