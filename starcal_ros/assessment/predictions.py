@@ -52,10 +52,12 @@ def predictions(estimate: Estimate) -> tuple[ResidualBin, ...]:
     if not used.any():
         return ()
     radius_px = _radius_px(estimate, table.measured_px)
+    in_time: Floats = np.empty(table.image_count)
+    in_time[np.argsort(estimate.linear.problem.time_s, kind='stable')] = np.arange(len(in_time))
     return (
         *_bins('radius', radius_px, found, expected, used),
         *_bins('magnitude', table.magnitude.astype(np.float64), found, expected, used),
-        *_bins('image', table.image.astype(np.float64), found, expected, used),
+        *_bins('image', in_time[table.image], found, expected, used),
         *_groups(estimate, expected, used),
     )
 

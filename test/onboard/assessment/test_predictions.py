@@ -102,6 +102,14 @@ def test_a_sound_camera_is_as_predicted_in_every_part() -> None:
         assert abs(one.normalised - 1.0) < 3.5 * one.sigma + 0.05, one
 
 
+def test_images_are_grouped_by_their_time_in_any_order() -> None:
+    given = of_random_pointings(3)
+    ensemble = true_observations(given)
+    turned = Ensemble(tuple(reversed(ensemble.images)))
+    one, other = ([b.normalised for b in bins_of(given, x, 'image')] for x in (ensemble, turned))
+    assert len(one) > 1 and one == pytest.approx(other, rel=1e-6)
+
+
 def test_few_images_are_not_predicted() -> None:
     given = of_random_pointings(13, images=3)
     assert bins_of(given, true_observations(given)) == []
