@@ -109,7 +109,9 @@ def _pointing(calibration: Calibration, _: str) -> float:
 
 def _of_parameters(names: tuple[str, ...], calibration: Calibration, unit: str) -> float:
     sigma = dict(zip(calibration.parameter_names, calibration.sigma, strict=True))
-    # A held parameter has no sigma of its own.
+    if not calibration.has_alignment:
+        sigma |= dict.fromkeys(ALIGNMENT_NAMES, 0.0)
+    # A held parameter has no sigma of its own, nor has an alignment to no star tracker.
     known = [sigma.get(name, 0.0) or math.nan for name in names]
     return float(np.max(known)) / (ARCSECOND_RAD if unit == 'arcsec' else 1.0)
 

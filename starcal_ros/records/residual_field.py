@@ -21,7 +21,9 @@ from starcal_ros.record_fields import Finite, Record, Shape, Within
 _DIGITS = 9  # parameters and field cancel to a thousandth and less in the factor
 # Steps of a coefficient's own 1-sigma: the sigma of any line of sight holds to 6e-4.
 _STEPS = 5000
-_NO_VARIANCE = 1e-12  # times the largest eigenvalue: smaller ones are rounding
+# Smallest eigenvalue of a scaled covariance, over the largest, that is more than rounding: at
+# 1e-12 the sigma of lines of sight of a rational polynomial was up to 9 % too small.
+NO_VARIANCE = 1e-15
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,7 +137,7 @@ def factored_field(of: DetectorField, covariance: MapCovariance) -> ResidualFiel
     known = np.sqrt(np.diag(matrix)[:p])
     scale = np.where(known > 0, known, 1.0)
     values, vectors = np.linalg.eigh(matrix[:p, :p] / np.outer(scale, scale))
-    used = values > _NO_VARIANCE * values.max()
+    used = values > NO_VARIANCE * values.max()
     vectors, root = vectors[:, used], np.sqrt(values[used])
     factor = np.concatenate(
         [known[:, None] * vectors * root, matrix[p:, :p] / scale @ vectors / root]

@@ -29,6 +29,7 @@ from starcal_ros.errors import OptionError
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.formats.products.product_files import calibration_text
 from starcal_ros.records import Calibration, ResidualField
+from starcal_ros.records.residual_field import NO_VARIANCE
 
 TABLE_FILE = 'starcal_camera.bin'
 _MAGIC = b'STARCALT'
@@ -46,7 +47,6 @@ _NAME_SIZE = 32  # STARCAL_NAME_SIZE
 _VECTORS_A_SIDE = 5
 _VECTOR_STEP_K = 7.0  # temperature step between test vectors
 _NO_FOLD = sys.float_info.max  # the table has finite numbers only
-_NO_VARIANCE = 1e-14  # relative eigenvalue of the scaled covariance that is rounding
 _BYTES_A_LINE = 20
 
 
@@ -104,7 +104,7 @@ def c_table(calibration: Calibration) -> bytes:
     numbers = [
         camera.parameters,
         [min(fold_radius2(camera.model, camera.distortion), _NO_FOLD)],
-        calibration.geometry.star_tracker_from_camera.as_matrix(),
+        calibration.geometry.star_tracker_from_camera.as_matrix() * calibration.has_alignment,
         _temperature(calibration),
         [field.unresolved_px],
         field.coefficients,
@@ -149,7 +149,7 @@ def _factored(calibration: Calibration) -> ResidualField:
         return field
     scale = np.where(calibration.sigma > 0, calibration.sigma, 1.0)
     values, vectors = np.linalg.eigh(calibration.covariance / np.outer(scale, scale))
-    used = values > _NO_VARIANCE * max(values.max(), 0.0)
+    used = values > NO_VARIANCE * max(values.max(), 0.0)
     factor = scale[:, None] * vectors[:, used] * np.sqrt(values[used])
     return ResidualField(0, np.empty((2, 0)), 0.0, factor, np.empty(0), np.empty(0, np.int16))
 

@@ -130,7 +130,8 @@ def mrcal_cameramodel(calibration: Calibration, _asked: Request) -> exported.Con
     camera, made = exported.fitted(calibration, own if LENSES[own].mrcal else _LARGEST, ('skew',))
     fx, _, fy, cx, cy = camera.intrinsics.tolist()
     _, D = ros_distortion(camera.model, camera.distortion)
-    rt = [*calibration.geometry.star_tracker_from_camera.inv().as_rotvec().tolist(), 0.0, 0.0, 0.0]
+    turn = calibration.geometry.star_tracker_from_camera.inv().as_rotvec()
+    rt = [*(turn * calibration.has_alignment).tolist(), 0.0, 0.0, 0.0]
     lines = [
         *_commented(exported.about(calibration, made)),
         '{',

@@ -83,7 +83,8 @@ def test_the_camera_alone_has_its_own_lines_of_sight() -> None:
     alone = dataclasses.replace(FOUND, parent_frame='')
     assert not alone.has_alignment
     assert Requirement.of('line_of_sight=5arcsec').sigma(alone) == 0.9
-    assert np.isnan(Requirement.of('pointing=5arcsec').sigma(alone))
+    for text in ('pointing=5arcsec', 'alignment_z=100arcsec'):
+        assert np.isnan(Requirement.of(text).sigma(alone))
 
 
 def with_causes(*causes: SigmaPart) -> Calibration:

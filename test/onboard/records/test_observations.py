@@ -80,6 +80,21 @@ def test_every_sigma_of_a_line_of_sight_holds_to_a_thousandth(stars: int, held: 
     assert np.linalg.eigvalsh(record.covariance).min() > -1e-9 * np.trace(record.covariance)
 
 
+def test_a_direction_of_little_variance_is_kept() -> None:
+    """Parameters of a rational lens are nearly collinear, and the field cancels the rest."""
+    assert CAMERA.field is not None
+    p, scale = len(SIGMA), np.r_[SIGMA, np.full(2 * TERMS, 0.05)]
+    turn = np.linalg.qr(np.random.default_rng(2).normal(size=(p, p)))[0]
+    root = np.zeros((len(scale), p))
+    root[:p] = turn * np.r_[np.ones(p - 1), 5e-7]
+    root[p:, -1] = 1.0
+    matrix = root @ root.T * np.outer(scale, scale)
+    record = factored_field(CAMERA.field, MapCovariance(matrix))
+    along = np.r_[turn[:, -1] / SIGMA, np.zeros(2 * TERMS)]
+    along[p] = 1.0 / 0.05
+    assert along @ record.covariance @ along == pytest.approx(along @ matrix @ along, rel=1e-3)
+
+
 def test_the_record_is_a_quarter_of_the_square() -> None:
     assert CAMERA.field is not None
     record = factored_field(CAMERA.field, covariance(300))

@@ -882,6 +882,13 @@ static void in_tangents(const double d[3], const double covariance3[9], double c
   }
 }
 
+/* A camera that was calibrated alone has a matrix of zeros. */
+static int has_alignment(const starcal_camera *camera)
+{
+  const double *row = camera->star_tracker_from_camera;
+  return row[0] != 0.0 || row[1] != 0.0 || row[2] != 0.0;
+}
+
 starcal_status starcal_covariance(const starcal_camera *camera, const double pixel[2],
                                   starcal_kind kind, double covariance3[9],
                                   double covariance2[4])
@@ -891,7 +898,7 @@ starcal_status starcal_covariance(const starcal_camera *camera, const double pix
   starcal_status status;
   int k;
   if (camera == NULL || pixel == NULL || !all_finite(pixel, 2) ||
-      (kind != STARCAL_POINTING && kind != STARCAL_SHAPE)) {
+      (kind != STARCAL_SHAPE && (kind != STARCAL_POINTING || !has_alignment(camera)))) {
     return STARCAL_BAD_ARGUMENT;
   }
   status = sight(camera, pixel, xy, d, by_lens);
@@ -974,7 +981,7 @@ starcal_status starcal_to_star_tracker(const starcal_camera *camera,
   double turned[3];
   int k;
   if (camera == NULL || direction_camera == NULL || direction == NULL ||
-      !all_finite(direction_camera, 3)) {
+      !all_finite(direction_camera, 3) || !has_alignment(camera)) {
     return STARCAL_BAD_ARGUMENT;
   }
   for (k = 0; k < 3; ++k) {
@@ -1034,8 +1041,9 @@ starcal_status starcal_self_test(const starcal_camera *camera)
     /* A pixel on the border may come back a rounding beyond it. */
     if (starcal_project(&there, d, back, NULL) > STARCAL_OUTSIDE ||
         !(hypot(back[0] - pixel[0], back[1] - pixel[1]) <= 1e-6) ||
-        starcal_covariance(&there, pixel, STARCAL_POINTING, covariance, NULL) != STARCAL_OK ||
-        !same_covariance(covariance, camera, first + 6) ||
+        (has_alignment(camera) &&
+         (starcal_covariance(&there, pixel, STARCAL_POINTING, covariance, NULL) != STARCAL_OK ||
+          !same_covariance(covariance, camera, first + 6))) ||
         starcal_covariance(&there, pixel, STARCAL_SHAPE, covariance, NULL) != STARCAL_OK ||
         !same_covariance(covariance, camera, first + 15)) {
       return STARCAL_SELF_TEST_FAILED;

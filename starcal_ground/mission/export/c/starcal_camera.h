@@ -28,7 +28,7 @@ enum {
 typedef enum {
   STARCAL_OK = 0,
   STARCAL_OUTSIDE = 1,          /* result is written, but lies beyond the detector */
-  STARCAL_BAD_ARGUMENT = 2,     /* a null pointer, a number that is not finite, or zero length */
+  STARCAL_BAD_ARGUMENT = 2,     /* null, not finite, of no length, or no alignment to give it */
   STARCAL_NO_IMAGE = 3,         /* the camera does not see the direction */
   STARCAL_NO_LINE_OF_SIGHT = 4, /* the lens model has no inverse at the pixel */
   STARCAL_NOT_A_TABLE = 5,      /* foreign data */
@@ -111,7 +111,7 @@ starcal_status starcal_covariance(const starcal_camera *camera, const double pix
 /* Axes across a unit direction: x and y of the camera, turned with z onto the direction. */
 starcal_status starcal_tangents(const double direction_camera[3], double x[3], double y[3]);
 
-/* A direction of the camera frame in the star tracker frame. */
+/* A direction of the camera frame in the star tracker frame; a camera alone has none. */
 starcal_status starcal_to_star_tracker(const starcal_camera *camera,
                                        const double direction_camera[3], double direction[3]);
 

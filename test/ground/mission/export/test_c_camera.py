@@ -188,6 +188,13 @@ def test_it_compiles_without_a_warning_and_passes_its_self_test(
     assert run(program, 'selftest') == (0, '')
 
 
+def test_a_camera_alone_has_no_direction_or_sigma_in_a_star_tracker_frame(tmp_path) -> None:
+    program = built(dataclasses.replace(calibration(), parent_frame=''), tmp_path)
+    assert run(program, 'selftest') == (0, '')
+    seen = np.array([[REFERENCE_DEGC, 100.0, 80.0]])
+    assert run(program, 'sights', lines=seen) == (0, '0\n')  # of the line of sight, and no more
+
+
 def test_the_budget_and_the_identity_of_the_calibration(tmp_path) -> None:
     budget = (SigmaPart('total', 0.16, 0.4, ''), SigmaPart('stars', 0.15, 0.1, 'estimated'))
     made = dataclasses.replace(calibration(), sigma_budget=budget)
