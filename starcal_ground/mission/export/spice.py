@@ -348,11 +348,13 @@ def ck_of_images(calibration: Calibration, asked: Request) -> exported.Content:
     if not attitudes:
         raise ProductError('--to ck: no image with stars among the observations')
     times_ns = sorted(attitudes)
-    icrf_from_frame = Rotation.concatenate([attitudes[time_ns][0] for time_ns in times_ns])
+    icrf_from_frame = Rotation.concatenate(
+        [attitudes[time_ns].icrf_from_camera for time_ns in times_ns]
+    )
     if names.star_tracker_id:
         icrf_from_frame = icrf_from_frame * calibration.geometry.star_tracker_from_camera.inv()
     structure = names.star_tracker_id or names.camera_id
-    sigma_px = float(np.median([sigma_px for _, sigma_px in attitudes.values()]))
+    sigma_px = float(np.median([one.sigma_px for one in attitudes.values()]))
     comments = _ck_comments(calibration, names, times_ns, sigma_px)
     q = np.roll(icrf_from_frame.inv().as_quat(), 1, axis=1)
     with loaded(asked.kernels) as spice:

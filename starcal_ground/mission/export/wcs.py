@@ -19,7 +19,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 from starcal_ground.bags.reader import OF_ANOTHER_BAG
 from starcal_ground.mission.export import exported
@@ -45,7 +44,6 @@ _MOST_DEG = 85.0  # from the middle: a gnomonic projection ends at 90 degrees
 # 0.6 over one of 20; the rest is in STARRMS.
 _MOST_ORDER_OF_SKY = 3
 _TOO_WIDE = '--to wcs: the field is too wide for a gnomonic projection: use --to opencv'
-_STARS_A_TERM = 3  # for each of its coefficients: places of the catalog have errors of their own
 
 
 def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
@@ -68,7 +66,7 @@ def wcs_of_images(calibration: Calibration, asked: Request) -> exported.Content:
         attitude = attitude_by_stars(calibration, image)
         if attitude is None:
             continue
-        system = _system(calibration, image, attitude[0], catalog)
+        system = _system(calibration, image, attitude.icrf_from_camera, catalog)
         header = fits.Header(system.cards())
         if TIMES not in calibration.provenance:  # else the stamps are no times of exposure
             header['DATE-AVG'] = utc_text(image.time_ns).removesuffix(' UTC').replace(' ', 'T')
@@ -117,7 +115,8 @@ def directions_icrf(
         Unit vectors; NaN as of `lines_of_sight`.
     sigma_arcsec : (n,)
         1-sigma, the root of the trace of the covariance: that of the camera, its common rotation
-        removed, and that of the attitude by the stars, larger where they scatter more than stated.
+        removed, that of the attitude by the stars, and what the stars show the image to have of
+        its own, by a camera that changes from image to image or a shutter that rolls.
 
     Raises
     ------
@@ -140,19 +139,15 @@ def directions_icrf(
     if attitude is None:
         raise ValueError('image: fewer than three stars determine no attitude')
     camera = camera_of_image(calibration, image)
-    directions = attitude[0].apply(detector_sight(camera, np.asarray(pixels_px, np.float64)))
-    off = attitude[0].apply(line_of_sight(camera, image.measured_px)) - image.direction_icrf
-    variance = image.covariance_px2[:, [0, 2]].mean(axis=1) / camera.parameters[0] ** 2
-    # Squares of two components over their variance, whose median is that of chi^2.
-    excess = max(1.0, float(np.median((off**2).sum(axis=1) / variance)) / chi2.median(2))
-    towards = image.direction_icrf
-    information = np.eye(3) * (1.0 / variance).sum() - np.einsum(
-        'ni,nj,n->ij', towards, towards, 1.0 / variance
+    sight = detector_sight(camera, np.asarray(pixels_px, np.float64))
+    directions = attitude.icrf_from_camera.apply(sight)
+    turn_px2 = attitude.covariance_px2
+    of_image_px2 = np.trace(turn_px2) + 2.0 * attitude.own_px2
+    of_image_px2 -= np.einsum('ni,ij,nj->n', directions, turn_px2, directions)
+    of_image_arcsec = np.sqrt(of_image_px2) / camera.parameters[0] / ARCSECOND_RAD
+    return directions, np.hypot(
+        line_of_sight_sigma_arcsec(calibration, pixels_px), of_image_arcsec
     )
-    turn = excess * np.linalg.inv(information)
-    of_attitude = np.trace(turn) - np.einsum('ni,ij,nj->n', directions, turn, directions)
-    of_camera_arcsec = line_of_sight_sigma_arcsec(calibration, pixels_px)
-    return directions, np.hypot(of_camera_arcsec, np.sqrt(of_attitude) / ARCSECOND_RAD)
 
 
 @dataclass(frozen=True)
@@ -236,8 +231,8 @@ def _system(
     shift = _gnomonic(middle, places) - apparent
     if not np.isfinite(shift).all():
         raise ProductError(_TOO_WIDE)
-    terms = (n for n in range(_MOST_ORDER_OF_SKY, -1, -1))
-    order = next(n for n in terms if _STARS_A_TERM * len(_exponents(n, 0)) <= len(image) or n == 0)
+    border = icrf_from_camera.apply(line_of_sight(camera, pixel_grid(camera, 2, 2).reshape(-1, 2)))
+    order = _order_of_sky(apparent, shift, _gnomonic(middle, border), camera.parameters[0])
     to_catalog = _fitted(apparent, shift, order, 0)
 
     def directions(pixels: Floats) -> Floats:
@@ -259,6 +254,25 @@ def _system(
     distance_px = np.linalg.norm(off_px, axis=1)
     good = off_px[without_outliers(distance_px)]
     return replace(system, stars_px=float(np.sqrt(np.mean(good**2))))
+
+
+def _order_of_sky(apparent: Floats, shift: Floats, corners: Floats, focal_px: float) -> int:
+    """
+    Largest order of a polynomial through shifts (n, 2) that is as good in the corners (4, 2).
+
+    Places of the catalog have errors of their own, and parallaxes are no polynomial: stars in a
+    part of an image determine no high order in the rest of it.
+    """
+    for order in range(_MOST_ORDER_OF_SKY, 0, -1):
+        at_stars, at_corners = _powers(apparent, order, 0), _powers(corners, order, 0)
+        left, terms = shift - at_stars @ _fitted(apparent, shift, order, 0), at_stars.shape[1]
+        if len(left) <= terms:
+            continue
+        variance = (left**2).sum() / (2 * (len(left) - terms))
+        root = at_corners @ np.linalg.pinv(at_stars)
+        if focal_px**2 * variance * (root**2).sum(axis=1).max() < _GOOD_PX**2:
+            return order
+    return 0
 
 
 def _polynomials(
