@@ -77,9 +77,7 @@ def tool(*arguments: object) -> subprocess.Popen[str]:
     )
 
 
-def test_json_is_the_same_bytes_from_any_number_of_workers(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path, capfd) -> None:
     written = []
     for count in (0, 2):
         folder = tmp_path / str(count)
@@ -297,9 +295,7 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
     ],
 )
-def test_a_bad_argument_is_named(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_argument_is_named(arguments, words, tmp_path, capsys) -> None:
     try:
         status = studies.main([*arguments, '-o', str(tmp_path / 'out')])
     except SystemExit as error:

@@ -167,9 +167,7 @@ def less_certain(by: str, low: float, high: float) -> dict[str, Any]:
         ),
     ],
 )
-def test_each_limit_trips_alone(
-    changes: dict[str, Any], limit: str, at_limit: Any, beyond: Any, words: str
-) -> None:
+def test_each_limit_trips_alone(changes, limit, at_limit, beyond, words) -> None:
     """The reason names what failed and what to do; its form is that of the next test."""
     found = dataclasses.replace(GOOD, **changes)
     assert reasons(found, GateOptions(**{limit: at_limit})) == ()
@@ -200,9 +198,7 @@ VELOCITY = HeldTerm('velocity_x_m_s', 0.0, -6e4, 8000.0)
         ),
     ],
 )
-def test_a_prior_that_the_stars_contradict_is_named(
-    term: HeldTerm, changes: dict[str, Any], sigmas: float, note: str
-) -> None:
+def test_a_prior_that_the_stars_contradict_is_named(term, changes, sigmas, note) -> None:
     found = dataclasses.replace(GOOD, **with_model(held=(term,), **changes))
     assert reasons(found, GateOptions(max_held_term_sigma=sigmas)) == ()
     (reason,) = reasons(found, GateOptions(max_held_term_sigma=sigmas - 0.1))
@@ -230,9 +226,7 @@ CHANGES = [
 
 
 @pytest.mark.parametrize(('limit', 'geometry', 'active', 'expected', 'remedy'), CHANGES)
-def test_each_limit_of_a_change_trips_alone(
-    limit: str, geometry: CameraGeometry, active: Calibration | None, expected: float, remedy: str
-) -> None:
+def test_each_limit_of_a_change_trips_alone(limit, geometry, active, expected, remedy) -> None:
     """The value found is the expected one, and a limit on either side of it decides."""
     found = dataclasses.replace(GOOD, geometry=geometry)
     check = checks(found, GateOptions(), active)[limit]
@@ -257,9 +251,7 @@ def test_each_limit_of_a_change_trips_alone(
         (TURNED_FAR, 'max_rotation_deg', '13 times max_rotation_deg and 0.61 deg'),
     ],
 )
-def test_a_limit_that_is_not_the_value_of_its_option_is_explained(
-    geometry: CameraGeometry, option: str, note: str
-) -> None:
+def test_a_limit_that_is_not_the_value_of_its_option_is_explained(geometry, option, note) -> None:
     found, loose = dataclasses.replace(GOOD, geometry=geometry), GateOptions(max_rotation_deg=7.0)
     assert checks(found, loose, None)[option].note == f'limit: {note}'
     assert checks(found, loose, GOOD)[option].note == ''
@@ -466,9 +458,7 @@ def test_a_number_that_no_calibration_has_is_refused(changes: dict[str, Any], re
         ),
     ],
 )
-def test_a_movement_is_a_rotation_and_a_change_of_shape(
-    after: CameraGeometry, rotation_deg: Any, most_px: Any
-) -> None:
+def test_a_movement_is_a_rotation_and_a_change_of_shape(after, rotation_deg, most_px) -> None:
     rotation_rad, left_px = movement(PRIOR, after)
     assert np.degrees(rotation_rad) == rotation_deg and left_px.max() == most_px
 

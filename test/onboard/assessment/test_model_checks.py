@@ -73,9 +73,7 @@ HAS_NARROW_PRIOR = {'prior_sigma': tuple(2.0 if k in (3, 4) else 0.0 for k in ra
     ('off_px', 'stated'),
     [(-30.0, IS_HELD), (3.0, IS_HELD), (30.0, HAS_NARROW_PRIOR)],
 )
-def test_a_principal_point_that_is_not_where_it_is_assumed_is_named(
-    off_px: float, stated: dict[str, Any]
-) -> None:
+def test_a_principal_point_that_is_not_where_it_is_assumed_is_named(off_px, stated) -> None:
     given = with_cx_off(of_random_pointings(8), off_px)
     checks = model_checks(estimated(given, true_observations(given), **stated))
     cx = held(checks, 'cx')

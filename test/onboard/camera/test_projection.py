@@ -223,9 +223,7 @@ RATIONAL_FOLD = CameraModel(
     ],
     ids=['slight', 'strong', 'outer branch', 'fisheye', 'sphere', 'rational'],
 )
-def test_beyond_the_fold_there_is_no_line_of_sight(
-    camera: CameraModel, summit: float, fold_rad: float
-) -> None:
+def test_beyond_the_fold_there_is_no_line_of_sight(camera, summit, fold_rad) -> None:
     radius = summit * np.array([0.2, 0.9, 0.999, 1.001, 1.1, 1.5, 2.0, 10.0])
     e = line_of_sight(camera, np.stack([500 + 500 * radius, np.full(8, 500.0)], axis=-1))
     assert np.isfinite(e[:3]).all() and np.isnan(e[3:]).all()
@@ -417,9 +415,7 @@ def test_an_octave_of_cosines_ends_at_half_its_longest_wave() -> None:
 
 
 @pytest.mark.parametrize(('width', 'height', 'octaves'), [(640, 512, 3), (300, 900, 2), (8, 8, 1)])
-def test_products_of_the_cosines_are_those_of_their_values(
-    width: int, height: int, octaves: int
-) -> None:
+def test_products_of_the_cosines_are_those_of_their_values(width, height, octaves) -> None:
     """Sums and differences of angles give the weighted Gram matrix to rounding."""
     generator = np.random.default_rng(3)
     pixels = generator.uniform(-0.5, [width - 0.5, height - 0.5], (500, 2))

@@ -154,9 +154,7 @@ def test_the_units_of_the_unknowns_do_not_matter() -> None:
     ],
     ids=['without data', 'alike', 'alike but for rounding'],
 )
-def test_a_column_that_says_nothing_of_its_own_is_not_observable(
-    factor: np.ndarray, words: str
-) -> None:
+def test_a_column_that_says_nothing_of_its_own_is_not_observable(factor, words) -> None:
     J = np.random.default_rng(5).normal(size=(20, 3))
     J[:, 2] = J[:, 1] * factor
     with pytest.raises(NotObservable, match=words):

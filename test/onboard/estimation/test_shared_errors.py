@@ -104,9 +104,7 @@ FEW_PAIRS = [(1e-4, 3e-4), (2e-4, 3e-4), (0.0, 3e-4)]
         ([(0.04, 1e-3), (0.0, 1e-3), (0.0, 1e-3)], (1e-3, 1e-5), 0.5, 0.03),
     ],
 )
-def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
-    moments: list[tuple[float, float]], excess: tuple[float, float], near: float, least: float
-) -> None:
+def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(moments, excess, near, least) -> None:
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     # Each octave is e^-0.7 of the one before, within e, and one in twenty is as any amplitude.
 
@@ -276,9 +274,7 @@ def stare(
 @pytest.mark.parametrize(
     ('place_px', 'rho'), [(0.0, 0.0), (0.03, 0.0), (0.0, 0.25), (0.1, 0.0), (0.0, 0.8)]
 )
-def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(
-    place_px: float, rho: float
-) -> None:
+def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(place_px, rho) -> None:
     shares = []
     for seed in range(12):
         found, sigma, _ = stare(seed, place_px, rho)

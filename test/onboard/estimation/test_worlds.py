@@ -68,9 +68,7 @@ def test_normalised_errors_are_chi_squared() -> None:
         ('per_image', ('distortion',)),
     ],
 )
-def test_held_parameters_keep_their_prior_to_the_last_bit(
-    method: str, estimate: tuple[str, ...]
-) -> None:
+def test_held_parameters_keep_their_prior_to_the_last_bit(method, estimate) -> None:
     made = sound(2)
     names = made.scenario.prior.camera.parameter_names
     asked = {*estimate, *(names[5:] if 'distortion' in estimate else ())}
@@ -165,9 +163,7 @@ def test_an_image_with_a_wrong_attitude_is_a_misfit_and_moves_nothing() -> None:
 
 
 @pytest.mark.parametrize(('images', 'flexing'), [(6, 2e-3), (18, 5e-4)])
-def test_the_sigma_of_a_lens_that_sags_covers_each_of_its_shapes(
-    images: int, flexing: float
-) -> None:
+def test_the_sigma_of_a_lens_that_sags_covers_each_of_its_shapes(images, flexing) -> None:
     made = simulate(World(images=images, flexing=flexing), 1)
     found = estimated(made)
     assert found.termination == 'converged' and found.kept.mean() > 0.99
@@ -180,9 +176,7 @@ def test_the_sigma_of_a_lens_that_sags_covers_each_of_its_shapes(
 
 
 @pytest.mark.parametrize(('seed', 'stated_arcsec'), [(1, 0.1), (2, 2.0), (3, 0.1)])
-def test_a_stated_sigma_that_is_far_too_small_bends_nothing(
-    seed: int, stated_arcsec: float
-) -> None:
+def test_a_stated_sigma_that_is_far_too_small_bends_nothing(seed, stated_arcsec) -> None:
     made = sound(seed)  # of 20 arcsec
     found = estimated(made, star_tracker_sigma_arcsec=(stated_arcsec,) * 3)
     assert found.termination == 'converged' and not found.misfit_image.any()

@@ -71,9 +71,7 @@ def pulls(
 @pytest.mark.parametrize('flux_dn', [500.0, 20000.0])
 @pytest.mark.parametrize('ratio', [0.01, 0.1, 0.45])
 @pytest.mark.parametrize('distance_px', [0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
-def test_the_pull_of_a_neighbour_is_that_of_the_fit(
-    flux_dn: float, ratio: float, distance_px: float
-) -> None:
+def test_the_pull_of_a_neighbour_is_that_of_the_fit(flux_dn, ratio, distance_px) -> None:
     pull_px, sigma_px, measured_dn = pull_of_a_neighbour(flux_dn, ratio, distance_px, 2.1)
     found, _, _ = pulls(measured_dn, ratio, distance_px, 2.1)
     # How much of the neighbour is in the flux is told to a part of it; either fit ends within

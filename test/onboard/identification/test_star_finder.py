@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import functools
 
@@ -82,9 +81,7 @@ def test_every_star_is_the_right_one(index: int) -> None:
     ('index', 'tilt_deg', 'roll_deg'),
     [(0, 0.1, -4.9), (4, 0.7, 0.0), (8, 1.45, 4.9), (4, 1.45, -4.9), (0, 1.45, 0.0)],
 )
-def test_an_alignment_that_launch_has_turned_is_acquired(
-    index: int, tilt_deg: float, roll_deg: float
-) -> None:
+def test_an_alignment_that_launch_has_turned_is_acquired(index, tilt_deg, roll_deg) -> None:
     angle = np.random.default_rng(index).uniform(0, 2 * np.pi)
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
     turn = Rotation.from_rotvec(np.radians(tilt_deg) * axis) * Rotation.from_rotvec(
@@ -173,9 +170,7 @@ def sharpened(pixels: np.ndarray, u: int, v: int) -> None:
         ('too_few_pixels', 'moment', sharpened),
     ],
 )
-def test_one_spoilt_star_is_left_out_by_its_reason(
-    reason: str, centroid: str, spoil: Callable[..., None]
-) -> None:
+def test_one_spoilt_star_is_left_out_by_its_reason(reason, centroid, spoil) -> None:
     one, image = shown(0)
     options = CentroidOptions(centroid=centroid)
 
@@ -215,9 +210,7 @@ def noise(sky: np.ndarray, seed: int) -> np.ndarray:
     ],
     ids=['dark', 'bright', *map('noise {}'.format, range(2)), 'mirrored'],
 )
-def test_an_image_without_the_stars_matches_nothing(
-    made_of: Callable[[np.ndarray], np.ndarray], refusals: list[str]
-) -> None:
+def test_an_image_without_the_stars_matches_nothing(made_of, refusals) -> None:
     one, image = shown(1)
     with pytest.raises(ImageRefused) as refusal:
         observed(Image(image.time_ns, made_of(image.pixels)), one.icrf_from_star_tracker_xyzw)
@@ -245,9 +238,7 @@ def test_refused_stars_are_told_with_their_places() -> None:
     assert np.abs(found.refused_px - true_px(one, found.refused_catalog_id)).max() < 0.5
 
 
-def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(monkeypatch) -> None:
     one, image = shown(2)
     marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
     before = observed(image, one.icrf_from_star_tracker_xyzw)

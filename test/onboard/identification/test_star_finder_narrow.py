@@ -82,9 +82,7 @@ def wrong(found: StarObservations, one: Scene) -> int:
         (2.5, 1.0, 0.5),
     ],
 )
-def test_the_window_follows_the_stated_sigma(
-    field_deg: float, off_deg: float, sigma_deg: float
-) -> None:
+def test_the_window_follows_the_stated_sigma(field_deg, off_deg, sigma_deg) -> None:
     for index in (1, 4):
         found = observed(field_deg, index, off_deg, sigma_deg)
         assert found.refusal == '' and len(found) >= 8
@@ -118,12 +116,7 @@ def test_fewer_than_five_stars_are_refused_with_the_reason() -> None:
     ids=['disc', 'large disc', 'limb'],
 )
 @pytest.mark.parametrize('off_deg', [0.002, 0.3], ids=['near', 'searched'])
-def test_the_limb_of_a_body_is_no_streak(
-    middle_px: tuple[float, float],
-    radius_px: float,
-    off_deg: float,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_limb_of_a_body_is_no_streak(middle_px, radius_px, off_deg, monkeypatch) -> None:
     one, image = shown(0.5, 4)
     v, u = np.indices(image.pixels.shape)
     lit = np.hypot(u - middle_px[0], v - middle_px[1]) < radius_px
@@ -138,9 +131,7 @@ def test_the_limb_of_a_body_is_no_streak(
 
 
 @pytest.mark.parametrize('rays', [0, 60])
-def test_the_psf_is_that_of_stars_not_of_cosmic_rays(
-    rays: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_psf_is_that_of_stars_not_of_cosmic_rays(rays, monkeypatch) -> None:
     one, image = shown(0.5, 4)
     pixels, rng = image.pixels.copy(), np.random.default_rng(2)
     v, u = rng.integers([5, 5], np.array(pixels.shape) - 5, (rays, 2)).T

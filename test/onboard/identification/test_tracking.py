@@ -112,9 +112,7 @@ def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
     assert float(np.sqrt((of_sigma**2).mean())) < 1.09
 
 
-def test_stars_left_out_as_too_faint_are_listed_as_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stars_left_out_as_too_faint_are_listed_as_refused(monkeypatch) -> None:
     whole, _ = searched(1)
     used = np.flatnonzero(np.isin(CATALOG.id, whole.catalog_id))
     refused = np.flatnonzero(np.isin(CATALOG.id, whole.refused_catalog_id))
@@ -316,9 +314,7 @@ def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> 
         _, track = track_stars(exposed(SHARP, index, detector)[1], track, SEARCH)
 
 
-def test_streaks_of_which_too_few_are_alone_are_searched_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_streaks_of_which_too_few_are_alone_are_searched_again(monkeypatch) -> None:
     _, track = searched(1)
     monkeypatch.setattr('starcal_ros.stars.image_model._ISOLATED_PX', 1000.0)
     with pytest.raises(ImageRefused, match='too few of them are alone') as refused:

@@ -297,9 +297,7 @@ def test_no_camera_fits_mirrored_noise() -> None:
         ('thin_prism', {'s1': 0.02, 's2': 0.3}, ('plumb_bob', 'thin_prism', 'tilted')),
     ],
 )
-def test_the_smallest_model_that_leaves_no_field_is_chosen(
-    model: str, coefficients: dict[str, float], chosen: tuple[str, ...]
-) -> None:
+def test_the_smallest_model_that_leaves_no_field_is_chosen(model, coefficients, chosen) -> None:
     given = with_lens(model, **coefficients)
     options = CalibrationOptions(
         star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec, velocity_sigma_m_s=10.0

@@ -151,11 +151,7 @@ def test_a_sample_at_the_image_needs_no_other() -> None:
     ],
 )
 def test_samples_that_give_no_attitude_are_named(
-    valid_s: tuple[int, ...],
-    invalid_s: tuple[int, ...],
-    at_s: float,
-    max_gap_s: float,
-    reason: str,
+    valid_s, invalid_s, at_s, max_gap_s, reason
 ) -> None:
     quaternions = random_quaternions(11, len(valid_s))
     held = history([(START_NS + t * S, q) for t, q in zip(valid_s, quaternions, strict=True)])
@@ -291,9 +287,7 @@ ARC_10_HZ = tuple(np.arange(-0.95, 1.0, 0.1))
         ((-0.3, 0.1, 0.9), 0.0, 0.6, 1.2),
     ],
 )
-def test_the_sigma_of_a_rate_is_its_scatter(
-    at_s: tuple[float, ...], memory_s: float, low: float, high: float
-) -> None:
+def test_the_sigma_of_a_rate_is_its_scatter(at_s, memory_s, low, high) -> None:
     """Error over sigma, rms; the errors of samples may be correlated, and here mostly are not."""
     rng = np.random.default_rng(7)
     apart_s = np.abs(np.subtract.outer(at_s, at_s))

@@ -212,9 +212,7 @@ def test_cone_finds_what_brute_force_finds(catalog, radius_deg, limit):
         (MotionSource.UNKNOWN_J2000, 13.0, 2026.0, 231.5),
     ],
 )
-def test_a_place_is_known_as_well_as_its_motion(
-    catalog, source: MotionSource, magnitude: float, jyear: float, mas: float
-) -> None:
+def test_a_place_is_known_as_well_as_its_motion(catalog, source, magnitude, jyear, mas) -> None:
     star = dataclasses.replace(
         catalog.select(slice(1)),
         motion_source=np.array([source], np.uint8),

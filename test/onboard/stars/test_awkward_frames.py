@@ -50,9 +50,7 @@ def test_a_black_sky_has_few_false_sources() -> None:
 
 @pytest.mark.parametrize('read_noise', [1.0, 3.0], ids=['under half a step', 'over a step'])
 @pytest.mark.parametrize('step_dn', [1, 16, 17, 257], ids='step of {}'.format)
-def test_values_that_step_are_measured_as_those_of_fewer_bits(
-    step_dn: int, read_noise: float
-) -> None:
+def test_values_that_step_are_measured_as_those_of_fewer_bits(step_dn, read_noise) -> None:
     """8 bits in the high ones of 12 (16) or scaled to 16 (257): the sigma is that of 8 bits."""
     xy = star_grid(3, 32)
     detector = dataclasses.replace(

@@ -282,9 +282,7 @@ def test_an_exact_velocity_is_not_sent_as_zero(sigma_m_s: float, sent: float) ->
     ('rate', 'sigma', 'is_known'),
     [(0.0, 0.0, False), (0.0, np.nan, False), (0.0, 1e-5, True), (1e-3, 0.0, True)],
 )
-def test_a_camera_at_rest_has_a_rate_with_a_sigma(
-    rate: float, sigma: float, is_known: bool
-) -> None:
+def test_a_camera_at_rest_has_a_rate_with_a_sigma(rate, sigma, is_known) -> None:
     message = observations_to_message(observations(), 'cam', plain)
     message.star_tracker_rate_rad_s = np.full(3, rate)
     message.star_tracker_rate_sigma_rad_s = np.full(3, sigma)

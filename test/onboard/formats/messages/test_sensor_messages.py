@@ -6,7 +6,6 @@ from __future__ import annotations
 import array
 import functools
 import itertools
-from pathlib import Path
 import struct
 import sys
 import tracemalloc
@@ -233,9 +232,7 @@ def test_compressed_refusals(data: bytes, reason: str) -> None:
         (ENCODED.replace(b'IDAT\x08', b'IDAT\x09'), 'is damaged'),
     ],
 )
-def test_files_and_messages_refuse_the_same_pictures(
-    tmp_path: Path, content: bytes, words: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_files_and_messages_refuse_the_same_pictures(tmp_path, content, words, capfd) -> None:
     with pytest.raises(ImageRefused, match=f'bad_layout: PNG: {words}'):
         decode_compressed(content, TIME_NS)
     (tmp_path / 'a.png').write_bytes(content)
@@ -266,9 +263,7 @@ def compressed(frame_id: str) -> Any:
 @pytest.mark.parametrize('frame_id', ['', 'c', 'ca', 'cam', 'camera', 'Ω'])
 @pytest.mark.parametrize('little', [True, False])
 @pytest.mark.parametrize('type_name', [IMAGE_TYPE, COMPRESSED_TYPE])
-def test_a_serialised_image_is_viewed_as_rosbags_reads_it(
-    type_name: str, little: bool, frame_id: str
-) -> None:
+def test_a_serialised_image_is_viewed_as_rosbags_reads_it(type_name, little, frame_id) -> None:
     kinds = {
         IMAGE_TYPE: image_to_message(Image(TIME_NS, RAMP), frame_id, make_message),
         COMPRESSED_TYPE: compressed(frame_id),

@@ -336,9 +336,7 @@ BAD = {
     [(text, *row) for text, rows in BAD.items() for row in rows],
     ids=itertools.count(),
 )
-def test_a_bad_camera_file_is_refused_by_file_and_key(
-    tmp_path: Path, text: str, old: str, new: str, words: str
-) -> None:
+def test_a_bad_camera_file_is_refused_by_file_and_key(tmp_path, text, old, new, words) -> None:
     path = tmp_path / 'camera.yaml'
     assert old in text
     path.write_text(text.replace(old, new))
