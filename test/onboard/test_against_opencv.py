@@ -54,25 +54,15 @@ def test_skew_adds_its_share_of_the_distorted_row(skew: float) -> None:
 
 @pytest.mark.parametrize('model', [lens.name for lens in LENSES.values() if lens.opencv])
 @pytest.mark.parametrize('seed', range(3))
-def test_pixels_of_every_model(model: str, seed: int) -> None:
-    camera = random_lens(model, seed)
-    e = directions(seed, 0.9)
-    expected, _ = opencv_of(camera, e)
+def test_pixels_and_derivatives_of_every_model(model: str, seed: int) -> None:
+    camera, e = random_lens(model, seed), directions(seed, 0.9)
+    expected, J = opencv_of(camera, e)
     # The same functions in another order of operations: roundings of numbers up to 3000 px.
     np.testing.assert_allclose(project(camera, e), expected, rtol=0, atol=1e-9)
-
-
-@pytest.mark.parametrize('model', [lens.name for lens in LENSES.values() if lens.opencv])
-def test_derivatives_of_every_model(model: str) -> None:
-    camera = random_lens(model, 7)
-    e = directions(7, 0.8)
-    _, J = opencv_of(camera, e)
     _, J_parameters, J_rotation = project_jacobians(camera, e)
     # Columns of ours without skew; of theirs, by the order of `ros_distortion`.
     ours = np.delete(J_parameters, 1, axis=-1)
-    count = len(camera.distortion)
-    numbers: np.ndarray = np.arange(count, dtype=np.float64)
-    _, order = ros_distortion(model, numbers)
+    _, order = ros_distortion(model, np.arange(len(camera.distortion), dtype=np.float64))
     if model == 'equidistant':  # fx fy, cx cy, k1 to k4, rotation 3, translation 3, skew
         intrinsics, coefficients, rotation = J[..., :4], J[..., 4:8], J[..., 8:11]
     else:  # rotation 3, translation 3, fx fy cx cy, coefficients

@@ -212,10 +212,13 @@ def test_a_prior_that_the_stars_contradict_is_named(term, changes, sigmas, note)
 LONGER = turned(0.0, fx=1818.0, fy=1819.01)
 TURNED = turned(0.2)
 TURNED_FAR = turned(6.0)
-# Beyond multiples of the limits: the angle of 3 % of the longer side, degrees.
+# Beyond multiples of the limits: the angle of 3 % of the longer side, degrees; and the note.
 OF_THE_PRIOR = {
-    'max_change_px': (0.0, 5.0),
-    'max_rotation_deg': (np.degrees(0.03 * 640 / 1800), 13.0),
+    'max_change_px': (0.0, 5.0, 'limit: 5 times max_change_px'),
+    'max_rotation_deg': (
+        *(np.degrees(0.03 * 640 / 1800), 13.0),
+        'limit: 13 times max_rotation_deg and 0.61 deg',
+    ),
 }
 CHANGES = [
     ('max_change_px', LONGER, None, 3.916, 'prior camera or lens_model does not match this lens'),
@@ -233,28 +236,16 @@ def test_each_limit_of_a_change_trips_alone(limit, geometry, active, expected, r
     # The curvature of the field takes 4 % off the first; the others agree to 1e-3.
     assert check.found == pytest.approx(expected, rel=0.05)
     # A change from the prior may be larger, as far as it is documented.
-    more, factor = OF_THE_PRIOR.get(limit, (0.0, 1.0)) if active is None else (0.0, 1.0)
+    more, factor, note = OF_THE_PRIOR[limit] if active is None else (0.0, 1.0, '')
     value = (check.found - more) / factor
     limits: list[dict[str, Any]] = [{limit: value * (1 + 1e-12)}, {limit: 0.99 * value}]
     at_limit, beyond = (GateOptions(**row) for row in limits)
     assert reasons(found, at_limit, active) == ()
+    assert checks(found, at_limit, active)[limit].note == note
     (reason,) = reasons(found, beyond, active)
     assert reason.startswith(check.name) and limits_in((reason,)) == [limit]
     assert reason.endswith(remedy) and len(reason) <= 200
     assert ('active calibration' in reason) == (active is not None)
-
-
-@pytest.mark.parametrize(
-    ('geometry', 'option', 'note'),
-    [
-        (LONGER, 'max_change_px', '5 times max_change_px'),
-        (TURNED_FAR, 'max_rotation_deg', '13 times max_rotation_deg and 0.61 deg'),
-    ],
-)
-def test_a_limit_that_is_not_the_value_of_its_option_is_explained(geometry, option, note) -> None:
-    found, loose = dataclasses.replace(GOOD, geometry=geometry), GateOptions(max_rotation_deg=7.0)
-    assert checks(found, loose, None)[option].note == f'limit: {note}'
-    assert checks(found, loose, GOOD)[option].note == ''
 
 
 @pytest.mark.parametrize(('width', 'limit_px'), [(640, 50.0), (1000, 64.0), (2592, 165.9)])
