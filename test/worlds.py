@@ -39,15 +39,12 @@ ESTIMATES = ROOT / '.pytest_cache' / 'estimates'
 def of_random_pointings(seed: int, images: int = 12) -> Scenario:
     """Return the small scenario with its images anywhere in the sky."""
     rng = np.random.default_rng([seed, 3])
-    fields = np.stack(
-        [
-            rng.uniform(0.0, 360.0, images),
-            np.degrees(np.arcsin(rng.uniform(-0.9, 0.9, images))),
-            rng.uniform(0.0, 360.0, images),
-        ],
-        axis=-1,
+    ra_deg = rng.uniform(0.0, 360.0, images)
+    dec_deg = np.degrees(np.arcsin(rng.uniform(-0.9, 0.9, images)))
+    roll_deg = rng.uniform(0.0, 360.0, images)
+    pointing = Inertial(
+        tuple(zip(ra_deg.tolist(), dec_deg.tolist(), roll_deg.tolist(), strict=True))
     )
-    pointing = Inertial(tuple((float(a), float(b), float(c)) for a, b, c in fields))
     return dataclasses.replace(
         scenario('small', seed), pointing=pointing, image_count=images, magnitude_limit=8.0
     )

@@ -187,13 +187,11 @@ def falling_line(x: np.ndarray) -> NormalEquations:
     )  # fmt: skip
 
 
-def test_a_search_without_end_says_so() -> None:
+def test_a_search_without_end_or_against_a_wall_says_so() -> None:
     solution = levenberg_marquardt(np.zeros(1), falling_line, add)
     assert not solution.converged
     assert solution.termination == 'iteration_limit' and solution.iterations == MOST_ROUNDS
 
-
-def test_a_search_against_a_wall_says_so() -> None:
     # Downhill leads out of the domain: no step is ever allowed, however short.
     def walled(x: np.ndarray) -> NormalEquations:
         normal = falling_line(x)

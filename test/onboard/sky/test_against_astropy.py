@@ -81,19 +81,6 @@ def unit_vectors(coordinates: SkyCoord) -> np.ndarray:
     return np.asarray(xyz / np.linalg.norm(xyz, axis=1, keepdims=True))
 
 
-@pytest.mark.parametrize('time_s', TIMES_S)
-def test_agrees_with_astropy_gcrs(time_s):
-    stars = random_stars(500)
-    time = Time(time_s, format='unix', scale='utc')
-    expected = unit_vectors(places(stars, time).transform_to(GCRS(obstime=time)))
-    ours = apparent_directions(stars, time_s * NANOSECONDS_PER_SECOND)
-    away_mas = np.linalg.norm(ours - expected, axis=1) / MAS_RAD
-    # astropy leaves out the light time across the Earth's orbit, 500 s of motion: 0.16 mas for
-    # Barnard's star.  Everything else is the same theory.
-    assert away_mas.max() < 0.2
-    assert np.median(away_mas) < 0.01
-
-
 SITES = [
     SiteOptions('ground', 37.18, -3.6, 700.0, air_pressure_hpa=930.0, air_temperature_degc=12.0),
     SiteOptions('ground', -33.0, 151.0, 10.0, air_pressure_hpa=1013.0, air_temperature_degc=25.0),
