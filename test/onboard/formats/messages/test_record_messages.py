@@ -179,11 +179,7 @@ def first(column: str, value: float) -> Any:
         ('temperature_degc', 1e300, r'temperature_degc: 1e\+300 is not within -273.15 to 1000'),
         ('velocity_sigma_m_s', -2.0, 'velocity_sigma_m_s: -2.0 is not at least 0'),
         ('velocity_sigma_m_s', np.inf, 'velocity_sigma_m_s: inf is not a finite number'),
-        (
-            'star_tracker_rate_rad_s',
-            np.array([0, 0, np.inf]),
-            r'star_tracker_rate_rad_s\[2\]: inf',
-        ),
+        ('star_tracker_rate_rad_s', np.r_[0, 0, np.inf], r'star_tracker_rate_rad_s\[2\]: inf'),
         ('attitude_gap_s', -1.0, 'attitude_gap_s: -1.0 is not at least 0'),
         ('background_dn', np.inf, 'background_dn: inf is not a finite number'),
         ('width', 2**32 - 1, 'width: 4294967295 is not within 0 to 65536'),
