@@ -66,14 +66,12 @@ class Small:
         return arrange(self.table, self.keep, self.table.covariance_px2)
 
     def linear(self) -> Linearisation:
-        """Linearisation at the state."""
         measurements = self.measurements()
         return Linearisation(
             self.problem, self.state, self.layout, measurements, self.predicted_px
         )
 
     def sums(self) -> StarSums:
-        """Sums over the stars at the state."""
         return star_sums(self.linear())
 
     def named(self, x: Floats) -> dict[str, Floats]:
@@ -251,6 +249,8 @@ def small(
 # Steps that move pixels by about a tenth: differences of the fourth order are exact to 1e-11
 # there, and the rounding of pixels is 1e-12 of such a step.
 _STEPS = {
+    'camera': np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-2, 1e-1, 1.0, 1e-3, 1e-3]),
+    'focal': np.array([1e-5, 1e-6]),
     'velocity': 8000.0,
     'colour': 1e-4,
     'readout': 0.02,
@@ -260,20 +260,12 @@ _STEPS = {
     'rate': 1e-5,
     'mountings': 1e-4,
 }
-_CAMERA_STEPS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-2, 1e-1, 1.0, 1e-3, 1e-3])
-_FOCAL_STEPS = np.array([1e-5, 1e-6])
 IMAGE_STEPS = np.array([1e-4, 1e-4, 1e-4, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 
 def shared_steps(given: Small) -> Floats:
     """Steps (P,) of finite differences."""
-    special = {'camera': _CAMERA_STEPS, 'focal': _FOCAL_STEPS}
-    return np.concatenate(
-        [
-            special[e.name] if e.name in special else np.full(len(e), _STEPS[e.name])
-            for e in given.layout.shared
-        ]
-    )
+    return np.concatenate([np.full(len(e), _STEPS[e.name]) for e in given.layout.shared])
 
 
 def difference(function: Callable[[float], Floats], step: float) -> Floats:
@@ -339,7 +331,6 @@ def dense(given: Small) -> Dense:
 
 @functools.cache
 def usual() -> tuple[Small, Dense]:
-    """Return the ensemble of the first seed, and its dense problem."""
     given = small()
     return given, dense(given)
 

@@ -52,7 +52,6 @@ def of_random_pointings(seed: int, images: int = 12) -> Scenario:
 
 @functools.cache
 def campaign(world: World, seed: int) -> Campaign:
-    """Return the observations of a world, made once."""
     return simulate(world, seed)
 
 
@@ -110,7 +109,6 @@ def estimated(given: Scenario, ensemble: Ensemble, **options: object) -> Estimat
 
 
 def estimate_of(made: Campaign, **options: object) -> Estimate:
-    """Return the estimate of a campaign that a test has changed."""
     chosen = options_of(made.scenario, **options)
     return estimate_calibration(made.ensemble, made.scenario.prior, chosen)
 

@@ -65,18 +65,6 @@ def only(rows: tuple[Row, ...], **values: object) -> Row:
     return row
 
 
-def tool(*arguments: object) -> subprocess.Popen[str]:
-    """Start a study as a person would, in a terminal's process group."""
-    return subprocess.Popen(
-        [sys.executable, '-m', 'studies', *map(str, arguments)],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-
-
 def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path, capfd) -> None:
     written = []
     for count in (0, 2):
@@ -125,7 +113,13 @@ def test_results_are_in_the_order_of_the_items() -> None:
 def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
     # The background of a shell ignores SIGINT, and what is started there inherits that.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    started = tool('coverage', '--trials', 100000, '--workers', 1, '-o', tmp_path / 'out')
+    out, pipe = str(tmp_path / 'out'), subprocess.PIPE
+    words = ['coverage', '--trials', '100000', '--workers', '1', '-o', out]
+    command = [sys.executable, '-m', 'studies', *words]
+    # As a person would, in a terminal's process group.
+    started = subprocess.Popen(
+        command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
     signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 240
     # A second of work is past the start of Python, which answers an interrupt by itself.

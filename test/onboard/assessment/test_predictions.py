@@ -173,7 +173,6 @@ def test_without_a_fault_no_part_stands_apart() -> None:
 
 
 def of_images(bins: list[ResidualBin]) -> list[ResidualBin]:
-    """The parts of the predictions of images."""
     return [one for one in bins if one.by in ('radius', 'magnitude', 'image')]
 
 

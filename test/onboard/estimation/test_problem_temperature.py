@@ -39,7 +39,6 @@ RATE_RAD = np.array([4.0, -6.0, 20.0]) * ARCSECOND_RAD
 
 
 def camera_of(temperature_degc: float, focal: tuple[float, ...]) -> CameraModel:
-    """The true camera at a temperature."""
     dT = temperature_degc - REFERENCE_DEGC
     factor = 1.0 + sum(a * dT ** (k + 1) for k, a in enumerate(focal))
     fx, skew, fy = TRUTH.camera.parameters[:3] * factor

@@ -28,14 +28,9 @@ from starcal_ros.estimation.shared_errors import (
 WIDTH = 1200
 
 
-def groups(rng: Generator, n: int = 60, count: int = 20) -> tuple[Indices, Floats]:
-    """Return groups of a few members and weights of very different sizes."""
-    return rng.integers(0, count, n), rng.uniform(0.05, 0.5, n) ** -2.0
-
-
 def test_a_pair_moment_is_the_weighted_mean_of_the_products_of_pairs() -> None:
     rng = np.random.default_rng(2)
-    group, weight = groups(rng, 30, 6)
+    group, weight = rng.integers(0, 6, 30), rng.uniform(0.05, 0.5, 30) ** -2.0
     star = rng.integers(0, 4, 30)
     residual = rng.normal(size=(30, 2))
     for of_star in (None, star):

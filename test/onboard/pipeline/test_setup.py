@@ -277,19 +277,15 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
         ('dark_frame', np.zeros((HEIGHT, WIDTH - 1), np.uint16), 'one channel of 640 x 512'),
         ('dark_frame', np.zeros((HEIGHT, WIDTH, 3), np.uint8), 'one channel of 640 x 512'),
         ('dark_frame', np.zeros((HEIGHT, WIDTH), np.float32), 'one channel of 640 x 512'),
-        ('dark_frame', None, r'dark_frame: .*map.png: no such file'),
         ('flat_field', np.ones((HEIGHT, WIDTH - 1), np.uint8), 'one channel of 640 x 512'),
         ('flat_field', np.zeros((HEIGHT, WIDTH), np.uint8), 'median is .*not positive'),
         ('flat_field', image().pixels, 'shows [0-9]+ stars: it is a frame of the sky'),
         ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'one channel of 640 x 512'),
         ('bad_pixel_map', np.ones((HEIGHT, WIDTH), np.uint8), 'marks 100% .* 0 for good pixels'),
-        ('bad_pixel_map', None, 'bad_pixel_map: .*map.png: no such file'),
     ],
 )
 def test_a_file_that_does_not_fit_is_named(camera_yaml, tmp_path, name, content, words) -> None:
-    is_float = content is not None and content.dtype == np.float32
-    path = tmp_path / ('map.tiff' if is_float else 'map.png')
-    if content is not None:
-        cv2.imwrite(str(path), content)
+    path = tmp_path / ('map.tiff' if content.dtype == np.float32 else 'map.png')
+    cv2.imwrite(str(path), content)
     with pytest.raises(OptionError, match=words):
         load_setup(values(camera_yaml, **{name: str(path)}))

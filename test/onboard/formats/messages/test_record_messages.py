@@ -16,6 +16,7 @@ import pytest
 from sample_records import (  # type: ignore[import-not-found]
     assert_same,
     calibration,
+    NEEDED,
     observations,
     plain,
     plain_calibration,
@@ -46,14 +47,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_to_message,
     status_to_message,
 )
-from starcal_ros.record_fields import fields_of
-from starcal_ros.records import (
-    EnsembleStatus,
-    GateCheck,
-    refused_image,
-    StarObservations,
-    TemperatureTerms,
-)
+from starcal_ros.records import EnsembleStatus, GateCheck, refused_image, TemperatureTerms
 
 
 def test_calibration_round_trip() -> None:
@@ -242,13 +236,6 @@ def test_refused_stars_are_found_by_reason() -> None:
     assert list(places) == ['blend', 'saturated']
     np.testing.assert_array_equal(places['blend'], record.refused_px[[0, 2, 3]])
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
-
-
-NEEDED = {
-    kind.in_messages.split('.')[0]
-    for kind in fields_of(StarObservations).values()
-    if not kind.has_default
-}
 
 
 def test_a_message_with_everything_but_the_stars_at_zero_says_nothing_else() -> None:
