@@ -64,7 +64,7 @@ def raw(encoding: str, width: int, height: int, step: int, big: bool, data: Any)
     return SimpleNamespace(encoding=encoding, is_bigendian=big, data=data, **sizes)
 
 
-CONTAINERS = (bytes, bytearray, memoryview, functools.partial(array.array, 'B'))
+CONTAINERS: tuple[Any, ...] = (bytes, bytearray, memoryview, functools.partial(array.array, 'B'))
 
 
 @pytest.mark.parametrize('encoding', ['mono8', '8UC1', 'mono16', '16UC1'])
