@@ -11,15 +11,7 @@ import pytest
 from starcal_ros.assessment.lookup import Derivatives, line_of_sight_table
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField, term_count
-from starcal_ros.records import (
-    Ensemble,
-    factored_field,
-    MapCovariance,
-    refused_image,
-    STAR_REFUSALS,
-    StarObservations,
-    StarRefusal,
-)
+from starcal_ros.records import factored_field, MapCovariance, STAR_REFUSALS, StarRefusal
 
 
 def test_codes_fit_their_arrays() -> None:
@@ -31,15 +23,6 @@ def test_codes_fit_their_arrays() -> None:
 def test_names_ascend_with_their_codes() -> None:
     """Messages list the names in order of the codes: as sorted, which is how 0.1 wrote them."""
     assert list(STAR_REFUSALS) == sorted(STAR_REFUSALS)
-
-
-def test_an_image_is_used_until_it_is_refused() -> None:
-    used = StarObservations.of_image(5, (640, 512), noise_dn=2.0)
-    assert (used.time_ns, used.width, used.height, used.noise_dn) == (5, 640, 512, 2.0)
-    assert used.refusal == used.detail == '' and len(used) == 0
-    refused = refused_image(5, 640, 512, 'no_match', 'three stars')
-    assert (refused.refusal, refused.detail) == ('no_match', 'three stars')
-    assert Ensemble().add(used).images and not Ensemble().add(refused).images
 
 
 OCTAVES = 3

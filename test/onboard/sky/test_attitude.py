@@ -68,16 +68,10 @@ def test_interpolation_is_slerp(seed: int, t: float) -> None:
 def test_both_directions_mean_one_rotation() -> None:
     q = random_quaternions(1, 1)[0]
     inverse = Rotation.from_quat(q).inv().as_quat()
-    direct = attitude_sample(START_NS, q, 'st_to_inertial')
-    other = attitude_sample(START_NS, inverse, 'inertial_to_st')
-    assert direct is not None and other is not None
-    v = np.array([0.3, -0.5, 0.8])
-    of_direct, of_other = (
-        Rotation.from_quat(sample.icrf_from_star_tracker_xyzw).apply(v)
-        for sample in (direct, other)
-    )
-    np.testing.assert_allclose(of_direct, Rotation.from_quat(q).apply(v), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(of_other, of_direct, rtol=0, atol=1e-15)
+    for sent, direction in ((q, 'st_to_inertial'), (inverse, 'inertial_to_st')):
+        sample = attitude_sample(START_NS, sent, direction)
+        assert sample is not None
+        assert angle_between(sample.icrf_from_star_tracker_xyzw, q) < 1e-15
 
 
 @pytest.mark.parametrize(
