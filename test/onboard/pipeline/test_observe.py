@@ -82,19 +82,12 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     assert np.degrees(np.median(elevation_rad)) == pytest.approx(20.0, abs=2.0)
     moved_px = pixel_px - drawn.pixel_px
     assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
-    place = {
-        number: (pixel, direction)
-        for number, pixel, direction in zip(
-            drawn.catalog_id.tolist(), pixel_px, bent_icrf, strict=True
-        )
-    }
     assert found.refusal == '' and len(found) > 100
-    uu, _, vv = found.covariance_px2.T
-    off_px = found.measured_px - [place[number][0] for number in found.catalog_id.tolist()]
-    in_sigma = off_px / np.sqrt(np.stack([uu, vv], axis=-1))
+    in_sigma = errors_sigma(dataclasses.replace(drawn, pixel_px=pixel_px), found)
     assert np.sqrt((in_sigma**2).mean()) < 1.2  # as of stars in space
     # What is recorded is the bent direction, so that a calibration from the record is the same.
-    recorded = [place[number][1] for number in found.catalog_id.tolist()]
+    bent = dict(zip(drawn.catalog_id.tolist(), bent_icrf, strict=True))
+    recorded = [bent[number] for number in found.catalog_id.tolist()]
     np.testing.assert_allclose(found.direction_icrf, recorded, rtol=0, atol=1e-12)
     zenith_icrf, refraction_arcsec = air_above(drawn.time_ns, made.site)
     np.testing.assert_array_equal(found.zenith_icrf, zenith_icrf)
