@@ -165,8 +165,6 @@ def small(
     *,
     terms: bool = True,
     two_trackers: bool = True,
-    assumed: Assumptions = ASSUMED,
-    tracker_arcsec: tuple[float, float, float] = (8.0, 10.0, 25.0),
     shapes_px: Floats | None = None,
     field_px: float = 0.0,
 ) -> Small:
@@ -202,7 +200,7 @@ def small(
         prior_parameters=CAMERA.parameters + rng.normal(size=len(names)) * 1e-3,
         prior_sigma=sigma,
         star_tracker_from_icrf=error * frame.inv() * camera_from_icrf,
-        star_tracker_sigma_rad=np.tile(np.array(tracker_arcsec) * ARCSECOND_RAD, (IMAGES, 1)),
+        star_tracker_sigma_rad=np.tile(np.array([8.0, 10.0, 25.0]) * ARCSECOND_RAD, (IMAGES, 1)),
         above_reference_k=np.array([-8.0, -1.0, 3.0, 7.0]),
         star_tracker=number,
         first_from_star_tracker=mountings if two_trackers else None,
@@ -232,7 +230,7 @@ def small(
         covariance,
         IMAGES,
     )
-    assumed = dataclasses.replace(assumed, colour=COLOUR)
+    assumed = dataclasses.replace(ASSUMED, colour=COLOUR)
     layout = unknowns_of(EntryInputs(problem, state, given_rates, (WIDTH, HEIGHT), assumed))
     keep = np.arange(len(image)) % STARS < np.array([20, 18, 16, 13])[image]
     made = Small(problem, state, table, given_rates, layout, keep)

@@ -273,10 +273,8 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[
     return (weights, tuple(trackers)), {name: one.reshape(2 * n, 2 * n) for name, one in V.items()}
 
 
-def widened(
-    given: Small, found: Posterior, errors: Shared, negligible: float = 1e-13
-) -> Posterior:
-    return with_shared_errors(found, given.sums(), given.linear(), *errors, negligible)
+def widened(given: Small, found: Posterior, errors: Shared) -> Posterior:
+    return with_shared_errors(found, given.sums(), given.linear(), *errors, negligible=1e-13)
 
 
 def propagated(

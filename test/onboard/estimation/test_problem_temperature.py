@@ -64,7 +64,6 @@ def observed(
     rate_rad: np.ndarray = RATE_RAD,
     temperatures_degc: np.ndarray = TEMPERATURES_DEGC,
     seed: int | None = None,
-    tracker_arcsec: tuple[float, ...] = TRACKER_ARCSEC,
 ) -> Ensemble:
     """Observations with the temperature-dependent camera; noise if a seed is given."""
 
@@ -76,7 +75,7 @@ def observed(
         return {'measured_px': pixels, 'temperature_degc': degc}
 
     exact: Ensemble = each_image(Ensemble(stars()), at_temperature)
-    return exact if seed is None else with_noise(exact, seed, tracker_arcsec)
+    return exact if seed is None else with_noise(exact, seed, TRACKER_ARCSEC)
 
 
 def with_temperatures(ensemble: Ensemble, degc: np.ndarray) -> Ensemble:

@@ -96,8 +96,8 @@ def test_lost_rows_are_found_while_tracking() -> None:
         track_stars(with_lost_rows(1, 256, 1), known, SEARCH)
 
 
-def places(n: int, seed: int = 1) -> np.ndarray:
-    return np.asarray(np.random.default_rng(seed).uniform([0, 0], [SHAPE[1], SHAPE[0]], (n, 2)))
+def places(n: int) -> np.ndarray:
+    return np.asarray(np.random.default_rng(1).uniform([0, 0], [SHAPE[1], SHAPE[0]], (n, 2)))
 
 
 @pytest.mark.parametrize('n', [0, 1, 19, 20, 60, 151, 400])

@@ -48,9 +48,9 @@ def drawn(one: Scene, index: int, scenario: Scenario = SCENARIO) -> Exposure:
     return dataclasses.replace(shown(index)[1], image=render(scenario, one, index))
 
 
-def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
+def assert_right(found: StarObservations, one: Scene) -> None:
     """Assert that every star is at the pixel of its catalog number."""
-    assert found.refusal == '' and len(found) >= least
+    assert found.refusal == '' and len(found) >= 100
     in_sigma = np.abs(errors_sigma(one, found))
     assert np.isfinite(in_sigma).all()
     # Several hundred normal deviates, some of them pulled by a faint neighbour: a wrong star is

@@ -41,15 +41,13 @@ def exposed(
     )
 
 
-def field(
-    seed: int, detector: Detector, options: CentroidOptions = PSF
-) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
+def field(seed: int, detector: Detector) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
     """Errors (n, 2), centroids, bound variances (n, 2), snr (n,) of one image of unlike stars."""
     xy = star_grid(seed)
     # The same contrast for any width: the area of the PSF.
     area = (detector.psf_sigma_px / 0.95) ** 2
     flux = area * unlike_fluxes(seed, len(xy))
-    found = measured(exposed(seed, xy, flux, detector), xy, options)
+    found = measured(exposed(seed, xy, flux, detector), xy)
     bound, snr = centroid_bound(xy, flux, detector, SHAPE)
     return found.xy_px - xy, found, bound[:, [0, 1], [0, 1]], snr
 

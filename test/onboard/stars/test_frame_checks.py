@@ -39,14 +39,13 @@ def frame(index: int = 0) -> NDArray[np.uint16]:
 def refusal(
     pixels: Pixels,
     before: Fingerprint | None = None,
-    time_ns: int = S,
     saturation_dn: float = 0.0,
     dark: Pixels | None = None,
     **options: float,
 ) -> str:
     """The reason for which a frame is refused; empty for a sound one."""
     sample = sample_rows(pixels)
-    seen = fingerprint(Image(time_ns, pixels), sample)
+    seen = fingerprint(Image(S, pixels), sample)
     try:
         screen(sample, seen, before, saturation_dn, dark, ScreeningOptions(**options))
     except ImageRefused as refused:
