@@ -66,14 +66,12 @@ class Small:
         return arrange(self.table, self.keep, self.table.covariance_px2)
 
     def linear(self) -> Linearisation:
-        """Linearisation at the state."""
         measurements = self.measurements()
         return Linearisation(
             self.problem, self.state, self.layout, measurements, self.predicted_px
         )
 
     def sums(self) -> StarSums:
-        """Sums over the stars at the state."""
         return star_sums(self.linear())
 
     def named(self, x: Floats) -> dict[str, Floats]:
@@ -167,8 +165,6 @@ def small(
     *,
     terms: bool = True,
     two_trackers: bool = True,
-    assumed: Assumptions = ASSUMED,
-    tracker_arcsec: tuple[float, float, float] = (8.0, 10.0, 25.0),
     shapes_px: Floats | None = None,
     field_px: float = 0.0,
 ) -> Small:
@@ -204,7 +200,7 @@ def small(
         prior_parameters=CAMERA.parameters + rng.normal(size=len(names)) * 1e-3,
         prior_sigma=sigma,
         star_tracker_from_icrf=error * frame.inv() * camera_from_icrf,
-        star_tracker_sigma_rad=np.tile(np.array(tracker_arcsec) * ARCSECOND_RAD, (IMAGES, 1)),
+        star_tracker_sigma_rad=np.tile(np.array([8.0, 10.0, 25.0]) * ARCSECOND_RAD, (IMAGES, 1)),
         above_reference_k=np.array([-8.0, -1.0, 3.0, 7.0]),
         star_tracker=number,
         first_from_star_tracker=mountings if two_trackers else None,
@@ -234,7 +230,7 @@ def small(
         covariance,
         IMAGES,
     )
-    assumed = dataclasses.replace(assumed, colour=COLOUR)
+    assumed = dataclasses.replace(ASSUMED, colour=COLOUR)
     layout = unknowns_of(EntryInputs(problem, state, given_rates, (WIDTH, HEIGHT), assumed))
     keep = np.arange(len(image)) % STARS < np.array([20, 18, 16, 13])[image]
     made = Small(problem, state, table, given_rates, layout, keep)
@@ -251,6 +247,8 @@ def small(
 # Steps that move pixels by about a tenth: differences of the fourth order are exact to 1e-11
 # there, and the rounding of pixels is 1e-12 of such a step.
 _STEPS = {
+    'camera': np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-2, 1e-1, 1.0, 1e-3, 1e-3]),
+    'focal': np.array([1e-5, 1e-6]),
     'velocity': 8000.0,
     'colour': 1e-4,
     'readout': 0.02,
@@ -260,20 +258,12 @@ _STEPS = {
     'rate': 1e-5,
     'mountings': 1e-4,
 }
-_CAMERA_STEPS = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-2, 1e-1, 1.0, 1e-3, 1e-3])
-_FOCAL_STEPS = np.array([1e-5, 1e-6])
 IMAGE_STEPS = np.array([1e-4, 1e-4, 1e-4, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0])
 
 
 def shared_steps(given: Small) -> Floats:
     """Steps (P,) of finite differences."""
-    special = {'camera': _CAMERA_STEPS, 'focal': _FOCAL_STEPS}
-    return np.concatenate(
-        [
-            special[e.name] if e.name in special else np.full(len(e), _STEPS[e.name])
-            for e in given.layout.shared
-        ]
-    )
+    return np.concatenate([np.full(len(e), _STEPS[e.name]) for e in given.layout.shared])
 
 
 def difference(function: Callable[[float], Floats], step: float) -> Floats:
@@ -339,7 +329,6 @@ def dense(given: Small) -> Dense:
 
 @functools.cache
 def usual() -> tuple[Small, Dense]:
-    """Return the ensemble of the first seed, and its dense problem."""
     given = small()
     return given, dense(given)
 

@@ -42,6 +42,9 @@ from starcal_ros.records import (
 )
 
 TIME_NS = 1_700_000_000_123_456_789
+OBSERVED = fields_of(StarObservations)
+NEEDED = {kind.in_messages.split('.')[0] for kind in OBSERVED.values() if not kind.has_default}
+"""Fields that a message of observations must have."""
 
 
 def observations(n: int = 5) -> StarObservations:
@@ -193,7 +196,6 @@ def without_field(found: Calibration | None = None) -> Calibration:
 
 
 def plain_calibration() -> Calibration:
-    """A calibration without optional fields."""
     return dataclasses.replace(
         without_field(),
         temperature=None,
@@ -235,7 +237,7 @@ def with_needed_fields(sent: StarObservations, **others: Any) -> StarObservation
     """Observations with the fields that a message must have, and these others."""
     needed = {
         name: getattr(sent, name)
-        for name, kind in fields_of(StarObservations).items()
+        for name, kind in OBSERVED.items()
         if not kind.has_default and name not in ('time_ns', 'width', 'height')
     }
     unknown = np.full(len(sent), np.nan, np.float32)
@@ -267,7 +269,6 @@ def attitude_message(kind: str, time_ns: int, xyzw: Any) -> Any:
 
 
 def plain(_type: str, /, **fields: Any) -> SimpleNamespace:
-    """Return a plain object with the fields of a message."""
     return SimpleNamespace(**fields)
 
 

@@ -13,7 +13,7 @@ from starcal_ground.simulation.rendering import render
 from starcal_ground.simulation.scenario import Detector, Scenario, Scene, scene
 from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.records import CameraGeometry, StarObservations
+from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.stars.centroiding import Centroids, measure_stars
 from starcal_ros.stars.detection import detect, measure_background
 from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
@@ -80,6 +80,10 @@ def exposure_of(scenario: Scenario, index: int) -> tuple[Scene, Exposure]:
     shown = scene(scenario, index)
     image = render(scenario, shown, index)
     return shown, Exposure(image, shown.icrf_from_star_tracker_xyzw, 0.5)
+
+
+def with_pixels(exposure: Exposure, pixels: np.ndarray) -> Exposure:
+    return dataclasses.replace(exposure, image=Image(exposure.image.time_ns, pixels))
 
 
 def true_px(shown: Scene, catalog_id: np.ndarray) -> np.ndarray:

@@ -39,15 +39,12 @@ ESTIMATES = ROOT / '.pytest_cache' / 'estimates'
 def of_random_pointings(seed: int, images: int = 12) -> Scenario:
     """Return the small scenario with its images anywhere in the sky."""
     rng = np.random.default_rng([seed, 3])
-    fields = np.stack(
-        [
-            rng.uniform(0.0, 360.0, images),
-            np.degrees(np.arcsin(rng.uniform(-0.9, 0.9, images))),
-            rng.uniform(0.0, 360.0, images),
-        ],
-        axis=-1,
+    ra_deg = rng.uniform(0.0, 360.0, images)
+    dec_deg = np.degrees(np.arcsin(rng.uniform(-0.9, 0.9, images)))
+    roll_deg = rng.uniform(0.0, 360.0, images)
+    pointing = Inertial(
+        tuple(zip(ra_deg.tolist(), dec_deg.tolist(), roll_deg.tolist(), strict=True))
     )
-    pointing = Inertial(tuple((float(a), float(b), float(c)) for a, b, c in fields))
     return dataclasses.replace(
         scenario('small', seed), pointing=pointing, image_count=images, magnitude_limit=8.0
     )
@@ -55,7 +52,6 @@ def of_random_pointings(seed: int, images: int = 12) -> Scenario:
 
 @functools.cache
 def campaign(world: World, seed: int) -> Campaign:
-    """Return the observations of a world, made once."""
     return simulate(world, seed)
 
 
@@ -113,7 +109,6 @@ def estimated(given: Scenario, ensemble: Ensemble, **options: object) -> Estimat
 
 
 def estimate_of(made: Campaign, **options: object) -> Estimate:
-    """Return the estimate of a campaign that a test has changed."""
     chosen = options_of(made.scenario, **options)
     return estimate_calibration(made.ensemble, made.scenario.prior, chosen)
 

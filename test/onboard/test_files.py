@@ -32,9 +32,7 @@ def test_an_exception_leaves_the_old_file(tmp_path: Path, error: type[BaseExcept
     assert path.read_text() == 'old' and names(tmp_path) == ['a']
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_litter(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_failed_write_leaves_the_old_file_and_no_litter(tmp_path, monkeypatch) -> None:
     path = tmp_path / 'c.json'
     write_atomically(path, 'old')
 

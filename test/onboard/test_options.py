@@ -113,15 +113,10 @@ def test_every_default_is_a_value_that_its_own_option_takes(options_class: type)
         assert field.metadata['description'], field.name
 
 
-def test_no_two_stages_share_a_name() -> None:
+def test_options_are_few_about_ten_are_basic_and_no_two_stages_share_a_name() -> None:
+    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
     # One flat file holds the options of all stages.
-    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
-    assert len(names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)) == len(fields)
-
-
-def test_options_are_few_and_about_ten_are_basic() -> None:
-    fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
-    assert len(fields) <= 70
+    assert len(names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)) == len(fields) <= 70
     assert 8 <= sum(field.metadata['basic'] for field in fields) <= 12
 
 

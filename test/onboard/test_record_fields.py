@@ -71,7 +71,6 @@ class Field:
     by_name: Mapping[str, Annotated[float, Finite()]] | None = None
 
     def __post_init__(self) -> None:
-        """Check a limit of the record's own."""
         if self.count > 9:
             raise ValueError(f'count: {self.count} is over 9')
 

@@ -65,21 +65,7 @@ def only(rows: tuple[Row, ...], **values: object) -> Row:
     return row
 
 
-def tool(*arguments: object) -> subprocess.Popen[str]:
-    """Start a study as a person would, in a terminal's process group."""
-    return subprocess.Popen(
-        [sys.executable, '-m', 'studies', *map(str, arguments)],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-    )
-
-
-def test_json_is_the_same_bytes_from_any_number_of_workers(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_json_is_the_same_bytes_from_any_number_of_workers(tmp_path, capfd) -> None:
     written = []
     for count in (0, 2):
         folder = tmp_path / str(count)
@@ -127,7 +113,13 @@ def test_results_are_in_the_order_of_the_items() -> None:
 def test_interrupted_leaves_in_one_line(tmp_path: Path) -> None:
     # The background of a shell ignores SIGINT, and what is started there inherits that.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    started = tool('coverage', '--trials', 100000, '--workers', 1, '-o', tmp_path / 'out')
+    out, pipe = str(tmp_path / 'out'), subprocess.PIPE
+    words = ['coverage', '--trials', '100000', '--workers', '1', '-o', out]
+    command = [sys.executable, '-m', 'studies', *words]
+    # As a person would, in a terminal's process group.
+    started = subprocess.Popen(
+        command, cwd=ROOT, stdout=pipe, stderr=pipe, text=True, start_new_session=True
+    )
     signal.signal(signal.SIGINT, before)
     deadline = time.monotonic() + 240
     # A second of work is past the start of Python, which answers an interrupt by itself.
@@ -297,9 +289,7 @@ def test_one_trial_and_unsolvable_cells_are_taken() -> None:
         (['table1', '--workers', '-1'], '--workers: -1 is not within 0'),
     ],
 )
-def test_a_bad_argument_is_named(
-    arguments: list[str], words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bad_argument_is_named(arguments, words, tmp_path, capsys) -> None:
     try:
         status = studies.main([*arguments, '-o', str(tmp_path / 'out')])
     except SystemExit as error:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -41,27 +42,20 @@ def covariance_of(camera: CameraModel) -> np.ndarray:
     return np.asarray(correlated * np.outer(scale, scale))
 
 
-def moved(camera: CameraModel, change: np.ndarray) -> tuple[CameraModel, Rotation]:
-    """A camera and the rotation of its frame after a change of all their numbers."""
-    p = len(camera.parameters)
-    field = camera.field
-    if field is not None:
-        coefficients = field.coefficients + change[p + 3 :].reshape(2, -1)
-        field = DetectorField(field.width, field.height, field.octaves, coefficients)
-    parameters = camera.parameters + change[:p]
-    # camera_from_star_tracker <- exp(-[dtheta x]) camera_from_star_tracker (Eq. 11).
-    rotation = Rotation.from_rotvec(change[p : p + 3])
-    return CameraModel(camera.width, camera.height, parameters, field=field), rotation
-
-
 def differences(camera: CameraModel, pixels: np.ndarray, change: np.ndarray) -> np.ndarray:
     """Movement (n, 3) of the directions of pixels by a change, from both of its sides."""
-    step = 0.01
-    ends = []
-    for sign in (1.0, -1.0):
-        other, rotation = moved(camera, sign * step * change)
+    p, field, ends = len(camera.parameters), camera.field, []
+    for step in (0.01 * change, -0.01 * change):
+        if field is not None:
+            coefficients = field.coefficients + step[p + 3 :].reshape(2, -1)
+            camera = dataclasses.replace(
+                camera, field=dataclasses.replace(field, coefficients=coefficients)
+            )
+        other = dataclasses.replace(camera, parameters=camera.parameters + step[:p])
+        # camera_from_star_tracker <- exp(-[dtheta x]) camera_from_star_tracker (Eq. 11).
+        rotation = Rotation.from_rotvec(step[p : p + 3])
         ends.append(rotation.apply(line_of_sight(other, pixels)))
-    return np.asarray((ends[0] - ends[1]) / (2.0 * step))
+    return np.asarray((ends[0] - ends[1]) / 0.02)
 
 
 @CAMERAS

@@ -73,9 +73,7 @@ HAS_NARROW_PRIOR = {'prior_sigma': tuple(2.0 if k in (3, 4) else 0.0 for k in ra
     ('off_px', 'stated'),
     [(-30.0, IS_HELD), (3.0, IS_HELD), (30.0, HAS_NARROW_PRIOR)],
 )
-def test_a_principal_point_that_is_not_where_it_is_assumed_is_named(
-    off_px: float, stated: dict[str, Any]
-) -> None:
+def test_a_principal_point_that_is_not_where_it_is_assumed_is_named(off_px, stated) -> None:
     given = with_cx_off(of_random_pointings(8), off_px)
     checks = model_checks(estimated(given, true_observations(given), **stated))
     cx = held(checks, 'cx')
@@ -151,7 +149,6 @@ def test_the_step_the_field_and_the_predictions_are_in_the_record() -> None:
 
 
 def breathing(ensemble: Ensemble, scales: Floats) -> Ensemble:
-    """The ensemble with each image scaled about its middle."""
     middle = np.array([WIDTH - 1, HEIGHT - 1]) / 2.0
 
     def scaled(k: int, image: StarObservations) -> dict[str, Floats]:
@@ -199,11 +196,8 @@ def test_a_lens_that_warms_is_no_velocity(sigma_m_s: float) -> None:
     scales = 6e-5 * np.sqrt(3.0) * np.linspace(-1.0, 1.0, 48)  # a ramp of unit rms
     made = dataclasses.replace(made, ensemble=breathing(made.ensemble, scales))
     found = estimate_of(made, shutter='global', velocity_sigma_m_s=sigma_m_s)
-    mean, covariance, layout = (
-        found.posterior.mean,
-        found.posterior.covariance,
-        found.linear.layout,
-    )
+    mean, covariance = found.posterior.mean, found.posterior.covariance
+    layout = found.linear.layout
     velocity, trend = layout.of(['velocity']), layout.of(['trend'])
     off_m_s = mean[velocity]
     chi2 = off_m_s @ np.linalg.solve(covariance[np.ix_(velocity, velocity)], off_m_s)

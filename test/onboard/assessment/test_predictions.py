@@ -26,9 +26,8 @@ from studies.worlds import ripple
 MIDDLE_PX = np.array([647.5, 511.5])
 
 
-def bins_of(given: Scenario, ensemble: Ensemble, by: str = '') -> list[ResidualBin]:
-    """The parts of the data, of one kind where it is named."""
-    return [one for one in predictions(estimated(given, ensemble)) if by in ('', one.by)]
+def bins_of(given: Scenario, ensemble: Ensemble) -> list[ResidualBin]:
+    return list(predictions(estimated(given, ensemble)))
 
 
 def worst_of(bins: list[ResidualBin]) -> ResidualBin:
@@ -181,7 +180,6 @@ def test_without_a_fault_no_part_stands_apart() -> None:
 
 
 def of_images(bins: list[ResidualBin]) -> list[ResidualBin]:
-    """The parts of the predictions of images."""
     return [one for one in bins if one.by in ('radius', 'magnitude', 'image')]
 
 

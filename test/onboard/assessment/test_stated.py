@@ -215,9 +215,7 @@ def test_what_the_stars_alone_do_not_determine_is_not_checked() -> None:
         {'held': (HeldTerm('velocity', 0.0, 6e4, 1e3, evidence=3.0),)},  # which does not decide
     ],
 )
-def test_a_wrong_statement_is_named_where_it_looks_like_a_camera_that_changes(
-    wrong: dict[str, Any],
-) -> None:
+def test_a_wrong_statement_is_named_where_it_looks_like_a_camera_that_changes(wrong) -> None:
     checks = dataclasses.replace(
         model_checks(), image_variation_px=0.4, **{'held': (), 'statements': (), **wrong}
     )

@@ -213,9 +213,7 @@ def images(
 
 
 @pytest.mark.parametrize('sigma_px', [(3.0, 0.5, 0.0), (0.0, 0.0, 2.0), (0.3, 0.3, 0.3)])
-def test_the_mode_of_the_shapes_is_that_of_the_dense_posterior(
-    sigma_px: tuple[float, ...],
-) -> None:
+def test_the_mode_of_the_shapes_is_that_of_the_dense_posterior(sigma_px) -> None:
     made = images(np.random.default_rng(2), sigma_px)
     best = shapes(made.sums).amplitudes
 

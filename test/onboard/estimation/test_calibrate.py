@@ -22,7 +22,7 @@ from starcal_ground.simulation.centroids import (
     true_observations,
 )
 from starcal_ground.simulation.scenario import scenario
-from starcal_ros.arrays import Floats, Mask
+from starcal_ros.arrays import Floats
 from starcal_ros.camera import line_of_sight, PARAMETER_NAMES, pixel_grid, project_jacobians
 from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation import calibrate
@@ -190,13 +190,6 @@ def test_the_line_of_sight_reaches_the_cramer_rao_bound() -> None:
     assert 1.0 < np.sqrt(np.median(reported_px2) / expected_px2) < 1.1
 
 
-def spoilt(ensemble: Ensemble, shift: Callable[[int, int], Floats]) -> tuple[Ensemble, list[Mask]]:
-    """Displace stars by the shift (n, 2) of image k with n stars; with the stars that it moves."""
-    shifts = [shift(k, len(image)) for k, image in enumerate(ensemble.images)]
-    moved = each_image(ensemble, lambda k, image: {'measured_px': image.measured_px + shifts[k]})
-    return moved, [np.asarray(one.any(axis=1)) for one in shifts]
-
-
 def anywhere(k: int, n: int) -> Floats:
     """One of ten stars, by 5 to 50 px."""
     rng = np.random.default_rng([2, k])
@@ -217,7 +210,9 @@ def to_the_right(k: int, n: int) -> Floats:
 )
 def test_gross_outliers_are_left_out(method: str, shift: Callable[[int, int], Floats]) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
-    images, bad = spoilt(noisy, shift)
+    shifts = [shift(k, len(image)) for k, image in enumerate(noisy.images)]
+    images = each_image(noisy, lambda k, image: {'measured_px': image.measured_px + shifts[k]})
+    bad = [one.any(axis=1) for one in shifts]
     found, moved = estimated(images, method), np.concatenate(bad)
     assert not found.kept[moved].any()
     assert np.count_nonzero(~found.kept[~moved]) <= 4

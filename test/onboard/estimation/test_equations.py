@@ -51,9 +51,7 @@ def dense_arrow(given: Small, truth: Dense) -> tuple[Floats, Floats]:
     return N, X.T @ r
 
 
-def test_information_is_the_dense_one_with_the_images_eliminated(
-    given: Small, truth: Dense, arrow: Equations
-) -> None:
+def test_information_is_the_dense_one_with_the_images_eliminated(given, truth, arrow) -> None:
     N, g = dense_arrow(given, truth)
     P = given.layout.count
     C = N[P:, P:]
@@ -68,9 +66,7 @@ def test_information_is_the_dense_one_with_the_images_eliminated(
     assert np.array_equal(arrow.information, arrow.information.T)
 
 
-def test_unknowns_of_the_images_follow_the_shared_ones(
-    given: Small, truth: Dense, arrow: Equations
-) -> None:
+def test_unknowns_of_the_images_follow_the_shared_ones(given, truth, arrow) -> None:
     N, g = dense_arrow(given, truth)
     P = given.layout.count
     rng = np.random.default_rng(1)

@@ -64,11 +64,9 @@ def prior_of(made: Scenario, model: str) -> CameraGeometry:
     return dataclasses.replace(prior, camera=camera)
 
 
-def estimate_of(made: Scenario, model: str, ensemble: Ensemble, **other: object) -> Estimate:
+def estimate_of(made: Scenario, model: str, ensemble: Ensemble) -> Estimate:
     options = CalibrationOptions(
-        estimate=ESTIMATE[model],
-        star_tracker_sigma_arcsec=made.star_tracker_sigma_arcsec,
-        **other,  # type: ignore[arg-type]
+        estimate=ESTIMATE[model], star_tracker_sigma_arcsec=made.star_tracker_sigma_arcsec
     )
     return estimate_calibration(ensemble, prior_of(made, model), options)
 

@@ -80,9 +80,7 @@ UNKNOWN = np.full(3, np.nan)
 
 
 @pytest.mark.parametrize('stated', [{}, {'shutter': 'rolling', 'readout_s': READOUT_S}])
-def test_without_any_rate_the_turn_of_a_low_orbit_is_in_the_sigma(
-    stated: dict[str, object],
-) -> None:
+def test_without_any_rate_the_turn_of_a_low_orbit_is_in_the_sigma(stated) -> None:
     """Left out where the shutter is unknown, focal lengths were 9 to 16 sigma off."""
     made = simulate(dataclasses.replace(ROLLING, rate_deg_s=0.055), 2)
     made = with_fields(made, lambda _: {'star_tracker_rate_rad_s': UNKNOWN})

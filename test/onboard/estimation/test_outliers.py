@@ -42,8 +42,8 @@ def usual() -> tuple[StarTable, Floats]:
     return table_of(image, star), np.clip(residual, -3.0 * SIGMA_PX, 3.0 * SIGMA_PX)
 
 
-def fits(residual: Floats, table: StarTable, place_px2: float = 0.0) -> Mask:
-    return fitting_stars(residual, table.covariance_px2, place_px2, table, apart(table), 4.5)
+def fits(residual: Floats, table: StarTable) -> Mask:
+    return fitting_stars(residual, table.covariance_px2, 0.0, table, apart(table), 4.5)
 
 
 def apart(table: StarTable) -> Groups:

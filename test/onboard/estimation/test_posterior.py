@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+import functools
 
 from four_images import (  # type: ignore[import-not-found]
     Dense,
@@ -24,6 +24,7 @@ from four_images import (  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.linalg import null_space
+from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats
 from starcal_ros.estimation.amplitudes import LARGEST_FIELD_PX, log_amplitudes
@@ -47,31 +48,23 @@ def solved(given: Small) -> Posterior:
     return posterior(given.sums(), given.linear(), SHAPE)
 
 
-@dataclass(frozen=True)
-class Varied:
+@functools.cache
+def varied() -> tuple[Small, Dense, Posterior]:
     """Four images whose scales differ by pixels, and their posterior."""
-
-    made: Small
-    truth: Dense
-    found: Posterior
-
-
-@pytest.fixture(scope='module')
-def varied() -> Varied:
     scales = np.zeros((IMAGES, len(SHAPE)))
     scales[:, 0] = [6.0, 5.0, 4.5, -3.0]
     scales[:, 1] = [1.0, -1.5, 0.3, 0.8]
     made = small(3, shapes_px=scales)
-    return Varied(made, dense(made), solved(made))
+    return made, dense(made), solved(made)
 
 
-def mixture(varied: Varied, shifts: Floats) -> tuple[Floats, Floats, Floats]:
+def mixture(shifts: Floats) -> tuple[Floats, Floats, Floats]:
     """Mean, covariance and weights of dense posteriors over a factor of the field's amplitudes."""
-    made, found, parts = varied.made, varied.found, []
+    (made, truth, found), parts = varied(), []
     offset = prior_offset(made)
     for log_px in found.field.log_px + shifts[:, None]:
         precision = prior_precision(made, found.shapes.sigma_px, np.exp(log_px))
-        mean, covariance, evidence = solution(varied.truth, precision, offset)
+        mean, covariance, evidence = solution(truth, precision, offset)
         # The prior of the logarithms: N(ln 1e-5, 4), and each octave e^-0.7 of the one before.
         steps = np.diff(log_px) + 0.7
         evidence -= 0.5 * (((log_px[0] - np.log(1e-5)) / 4.0) ** 2 + steps @ steps)
@@ -85,7 +78,6 @@ def mixture(varied: Varied, shifts: Floats) -> tuple[Floats, Floats, Floats]:
 
 
 def normalised(log: Floats) -> Floats:
-    """Weights of a sum of one by their logarithms."""
     weight = np.exp(log - log.max())
     return np.asarray(weight / weight.sum())
 
@@ -115,13 +107,13 @@ def with_lens_term(
     return mean + first * (pull @ mean) * along, covariance + spread * np.outer(along, along)
 
 
-def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied) -> None:
-    made, found, result = varied.made, varied.found, varied.found.shapes
-    mode_px = found.field.log_px
+def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field() -> None:
+    made, truth, found = varied()
+    result, mode_px = found.shapes, found.field.log_px
     shifts = found.last_octave[0] - mode_px[-1]
     assert shifts.min() == pytest.approx(-8.0)
     assert shifts.max() <= np.log(LARGEST_FIELD_PX) - mode_px.max() + 1e-9
-    mean, covariance, weight = mixture(varied, shifts)
+    mean, covariance, weight = mixture(shifts)
     # Evidences are rounded by 1e-6: the smallest prior of the field is 1e-9 px.
     assert found.last_octave[1] == pytest.approx(weight, abs=1e-5)
     P = made.layout.count
@@ -152,16 +144,16 @@ def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field(varied: Varied
     size = np.sqrt(np.diag(covariance)[P:])
     assert np.abs((found.of_images.ravel() - mean[P:]) / size).max() < 1e-5
     # The number of unknowns that the data determine, without those of the images.
-    X = np.concatenate([varied.truth.stars, varied.truth.trackers])
+    X = np.concatenate([truth.stars, truth.trackers])
     N = X.T @ X
     N[P:, P:] += np.diag(prior_precision(made, result.sigma_px, None)[P:])
     information = N[:P, :P] - N[:P, P:] @ np.linalg.solve(N[P:, P:], N[P:, :P])
     assert found.resolved == pytest.approx(np.trace(information[part] @ working[part]), rel=1e-5)
 
 
-def test_shapes_have_the_likelihood_of_contrasts_free_of_everything_else(varied: Varied) -> None:
+def test_shapes_have_the_likelihood_of_contrasts_free_of_everything_else() -> None:
     """Beside the field at the amplitudes and shapes before."""
-    made, whole, found = varied.made, varied.truth, varied.found
+    made, whole, found = varied()
     P = made.layout.count
     precision, offset = prior_precision(made, SHAPE, None), prior_offset(made)
     before = prior_precision(made, SHAPE, np.exp(found.field.log_px))
@@ -220,12 +212,8 @@ def test_what_a_star_lacks_leaves_no_variance_of_a_smear_negative(given: Small) 
     assert greater.covariance_px2[0] == pytest.approx([0.31, 0.0, 1.11])
 
 
-@dataclass(frozen=True)
-class Shared:
-    """Errors that observations and attitudes share."""
-
-    weights: Weighting
-    trackers: tuple[TrackerErrors, ...]
+Shared = tuple[Weighting, tuple[TrackerErrors, ...]]
+"""Errors that observations and attitudes share."""
 
 
 def weighted(
@@ -246,9 +234,7 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[
     """
     rng = np.random.default_rng(4)
     n = len(given.table)
-    angle = rng.uniform(0.0, 6.0, n)
-    cos, sin = np.cos(angle), np.sin(angle)
-    from_sky = np.stack([np.stack([cos, -sin], 1), np.stack([sin, cos], 1)], 1)
+    from_sky = Rotation.from_euler('z', rng.uniform(0.0, 6.0, n)).as_matrix()[:, :2, :2]
     used = given.keep
     cells = np.where(used, rng.integers(0, 9, n), -1)
     star = np.where(used, given.table.star, -1)
@@ -284,16 +270,11 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[
                 V['star places'][i, :, j] = place_px**2 * common @ from_sky[i] @ from_sky[j].T
             if cells[i] == cells[j]:
                 V['cells'][i, :, j] = cell_px**2 * common
-    return Shared(weights, tuple(trackers)), {
-        name: one.reshape(2 * n, 2 * n) for name, one in V.items()
-    }
+    return (weights, tuple(trackers)), {name: one.reshape(2 * n, 2 * n) for name, one in V.items()}
 
 
-def widened(
-    given: Small, found: Posterior, errors: Shared, negligible: float = 1e-13
-) -> Posterior:
-    shared_by = errors.weights, errors.trackers
-    return with_shared_errors(found, given.sums(), given.linear(), *shared_by, negligible)
+def widened(given: Small, found: Posterior, errors: Shared) -> Posterior:
+    return with_shared_errors(found, given.sums(), given.linear(), *errors, negligible=1e-13)
 
 
 def propagated(
@@ -305,7 +286,7 @@ def propagated(
     A = gain[:, :count] @ white
     parts = {name: A @ one @ A.T for name, one in V.items()}
     noise, slow, working = np.zeros((3, len(gain), len(gain)))
-    for one in errors.trackers:
+    for one in errors[1]:
         of_groups = one.covariance - one.independent * np.eye(len(one.covariance))
         for axis in one.axes:
             B = gain[:, count + 3 * one.images + axis]
@@ -369,7 +350,7 @@ def test_independent_errors_of_the_working_weights_change_nothing(given: Small) 
     alone = SharedError('alone', np.arange(n), np.ones(n), 0.0, False, 1.0)
     weights = weighted(given, np.tile(np.eye(2), (n, 1, 1)), np.ones(n), alone)
     found = solved(given)
-    after = widened(given, found, Shared(weights, (_exact(given, np.eye(IMAGES)),)))
+    after = widened(given, found, (weights, (_exact(given, np.eye(IMAGES)),)))
     sigma = np.sqrt(np.diag(found.covariance).clip(1e-300))
     free = found.estimated
     off = (after.covariance - found.covariance) / np.outer(sigma, sigma)
@@ -383,7 +364,7 @@ def test_star_trackers_beyond_the_stars_only_enter_the_alignment(given: Small) -
     shared_all = 50.0 * np.ones((IMAGES, IMAGES)) + np.eye(IMAGES)
     weights = weighted(plain, np.tile(np.eye(2), (n, 1, 1)), np.ones(n))
     found = solved(plain)
-    after = widened(plain, found, Shared(weights, (_exact(plain, shared_all),)))
+    after = widened(plain, found, (weights, (_exact(plain, shared_all),)))
     added = after.covariance - found.covariance
     at = plain.layout.of(['alignment'])
     # Its axes are those of the star tracker: turned into the camera frame.

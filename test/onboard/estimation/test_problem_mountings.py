@@ -193,9 +193,7 @@ def test_a_star_tracker_that_drifts_is_named_and_loses_no_image(jump_deg: float)
         ([0, 1, 1, 1] * 4, 'x', 20.0),
     ],
 )
-def test_a_wrong_mounting_costs_no_image_and_is_named(
-    heads: list[int], axis: str, degrees: float
-) -> None:
+def test_a_wrong_mounting_costs_no_image_and_is_named(heads, axis, degrees) -> None:
     wrong = Rotation.from_euler(axis, degrees, degrees=True)
     given, ensemble = campaign(3, heads, wrong=wrong)
     found = estimated(given, ensemble)

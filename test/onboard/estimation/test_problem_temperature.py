@@ -39,7 +39,6 @@ RATE_RAD = np.array([4.0, -6.0, 20.0]) * ARCSECOND_RAD
 
 
 def camera_of(temperature_degc: float, focal: tuple[float, ...]) -> CameraModel:
-    """The true camera at a temperature."""
     dT = temperature_degc - REFERENCE_DEGC
     factor = 1.0 + sum(a * dT ** (k + 1) for k, a in enumerate(focal))
     fx, skew, fy = TRUTH.camera.parameters[:3] * factor
@@ -65,7 +64,6 @@ def observed(
     rate_rad: np.ndarray = RATE_RAD,
     temperatures_degc: np.ndarray = TEMPERATURES_DEGC,
     seed: int | None = None,
-    tracker_arcsec: tuple[float, ...] = TRACKER_ARCSEC,
 ) -> Ensemble:
     """Observations with the temperature-dependent camera; noise if a seed is given."""
 
@@ -77,7 +75,7 @@ def observed(
         return {'measured_px': pixels, 'temperature_degc': degc}
 
     exact: Ensemble = each_image(Ensemble(stars()), at_temperature)
-    return exact if seed is None else with_noise(exact, seed, tracker_arcsec)
+    return exact if seed is None else with_noise(exact, seed, TRACKER_ARCSEC)
 
 
 def with_temperatures(ensemble: Ensemble, degc: np.ndarray) -> Ensemble:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.random import Generator
 import pytest
 from scipy.integrate import quad
+from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from starcal_ros.arrays import Floats, Indices
@@ -27,14 +28,9 @@ from starcal_ros.estimation.shared_errors import (
 WIDTH = 1200
 
 
-def groups(rng: Generator, n: int = 60, count: int = 20) -> tuple[Indices, Floats]:
-    """Return groups of a few members and weights of very different sizes."""
-    return rng.integers(0, count, n), rng.uniform(0.05, 0.5, n) ** -2.0
-
-
 def test_a_pair_moment_is_the_weighted_mean_of_the_products_of_pairs() -> None:
     rng = np.random.default_rng(2)
-    group, weight = groups(rng, 30, 6)
+    group, weight = rng.integers(0, 6, 30), rng.uniform(0.05, 0.5, 30) ** -2.0
     star = rng.integers(0, 4, 30)
     residual = rng.normal(size=(30, 2))
     for of_star in (None, star):
@@ -64,12 +60,6 @@ LOG_PX = log_amplitudes(LARGEST_FIELD_PX)
 ALONE = np.exp(-0.5 * ((LOG_PX - math.log(1e-5)) / 4.0) ** 2)
 
 
-def posterior_mean(estimate: float, sigma: float) -> float:
-    """Return the mean variance of one error alone."""
-    (mean,) = chain_means(ALONE, [(estimate, sigma)])
-    return mean
-
-
 @pytest.mark.parametrize(
     ('estimate', 'sigma'),
     [(0.0, 1e-4), (-1e-4, 1e-4), (4e-4, 1e-4), (0.01, 1e-4), (0.0, math.inf)],
@@ -85,7 +75,7 @@ def test_a_posterior_mean_is_the_integral_over_the_prior(estimate: float, sigma:
     above = quad(lambda s: math.exp(2 * s) * density(s), low, high, **options)[0]
     below = quad(density, low, high, **options)[0]
     # Steps of the grid are 17 % of a variance; half of one at most.
-    assert posterior_mean(estimate, sigma) == pytest.approx(above / below, rel=0.08)
+    assert chain_means(ALONE, [(estimate, sigma)]) == pytest.approx([above / below], rel=0.08)
 
 
 FEW_PAIRS = [(1e-4, 3e-4), (2e-4, 3e-4), (0.0, 3e-4)]
@@ -104,9 +94,7 @@ FEW_PAIRS = [(1e-4, 3e-4), (2e-4, 3e-4), (0.0, 3e-4)]
         ([(0.04, 1e-3), (0.0, 1e-3), (0.0, 1e-3)], (1e-3, 1e-5), 0.5, 0.03),
     ],
 )
-def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(
-    moments: list[tuple[float, float]], excess: tuple[float, float], near: float, least: float
-) -> None:
+def test_a_chain_of_octaves_is_the_sum_over_all_amplitudes(moments, excess, near, least) -> None:
     last = np.log([1e-3, 1e-2]), np.array([0.3, 0.7])
     # Each octave is e^-0.7 of the one before, within e, and one in twenty is as any amplitude.
 
@@ -152,13 +140,6 @@ def errors_of(
     return shared_errors(residual, variance, np.ones(n, bool), kinds, rolled, last, unknown)
 
 
-def random_rolls(rng: Generator, images: int, each: int = 1) -> Floats:
-    """Rotations (images * each, 2, 2) from the sky to the detector, those of an image alike."""
-    angle = np.repeat(rng.uniform(0.0, 2.0 * np.pi, images), each)
-    cos, sin = np.cos(angle), np.sin(angle)
-    return np.stack([np.stack([cos, -sin], 1), np.stack([sin, cos], 1)], 1)
-
-
 def campaign(
     rng: Generator, place_px: float = 0.0, cells_px: float = 0.0
 ) -> tuple[SharedError, ...]:
@@ -170,7 +151,8 @@ def campaign(
     m, n, noise_px = 30, 60, 0.1
     star = np.tile(np.arange(n), m)
     pixels = rng.uniform(0.0, WIDTH - 1.0, (m * n, 2))
-    from_sky = random_rolls(rng, m, n)
+    angle = np.repeat(rng.uniform(0.0, 2.0 * np.pi, m), n)
+    from_sky = Rotation.from_euler('z', angle).as_matrix()[:, :2, :2]
     place = place_px * rng.normal(size=(n, 2))
     residual = noise_px * rng.normal(size=(m * n, 2))
     residual += np.einsum('nij,nj->ni', from_sky, place[star])
@@ -276,9 +258,7 @@ def stare(
 @pytest.mark.parametrize(
     ('place_px', 'rho'), [(0.0, 0.0), (0.03, 0.0), (0.0, 0.25), (0.1, 0.0), (0.0, 0.8)]
 )
-def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(
-    place_px: float, rho: float
-) -> None:
+def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(place_px, rho) -> None:
     shares = []
     for seed in range(12):
         found, sigma, _ = stare(seed, place_px, rho)

@@ -163,9 +163,7 @@ def test_the_posterior_is_the_dense_average_over_the_grid(
         (0.5, 2.0, 40.0, 0.3, 1.3),
     ],
 )
-def test_the_sigma_of_the_mean_covers_white_noise_and_walks(
-    noise: float, slow: float, time: float, low: float, high: float
-) -> None:
+def test_the_sigma_of_the_mean_covers_white_noise_and_walks(noise, slow, time, low, high) -> None:
     # A slow error as large as the noise stays until the images say otherwise: for white noise the
     # sigma is three times too large.
     rng = np.random.default_rng(3)
@@ -255,9 +253,7 @@ def test_a_slow_error_is_as_large_about_an_axis_of_more_noise(stated_arcsec: flo
 
 
 @pytest.mark.parametrize('freedom', [1, 3, 17, 100])
-def test_errors_alone_scatter_beyond_the_largest_of_three_axes_once_in_a_hundred(
-    freedom: int,
-) -> None:
+def test_errors_alone_scatter_beyond_the_largest_of_three_axes_once_in_a_hundred(freedom) -> None:
     rng = np.random.default_rng(freedom)
     errors = rng.normal(size=(10_000, freedom, 3))
     largest = np.linalg.eigvalsh(errors.transpose(0, 2, 1) @ errors / freedom)[:, -1]

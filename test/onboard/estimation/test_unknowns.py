@@ -76,9 +76,7 @@ def test_labels_have_a_name_and_a_unit_for_each_unknown(given: Small) -> None:
     assert layout['velocity'].labels[1] == 'velocity_y_m_s'
 
 
-def test_octaves_are_of_wavelengths_down_to_a_width_its_half_and_its_quarter(
-    given: Small,
-) -> None:
+def test_octaves_are_of_wavelengths_down_to_a_width_its_half_and_its_quarter(given) -> None:
     entry = given.layout['field']
     assert entry.octave is not None and np.array_equal(entry.octave, octaves(given))
     # All cosines down to a quarter of the width but the constant, for u and for v.
@@ -247,9 +245,7 @@ def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     assert after < now == pytest.approx(sigma**2)
 
 
-def test_the_check_of_a_prior_of_an_added_unknown_names_its_remedy(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_check_of_a_prior_of_an_added_unknown_names_its_remedy(monkeypatch) -> None:
     check = check_of(solved(monkeypatch, 0.1))
     assert check.passed is False
     assert check.note.startswith('the stars add 2.') and check.note.endswith('; state the mass')

@@ -58,24 +58,19 @@ def pulls_on(
     return neighbour_pulls(xy_px, magnitude, flux_dn, model, none, ~none)
 
 
-def pulls(
-    flux_dn: float, ratio: float, distance_px: float, noise_dn: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def pulls(ratio: float, distance_px: float, flux_dn: list[float], noise_dn: float) -> Pulls:
+    """Pulls on two stars whose fluxes are those that are measured."""
     pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
     magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
-    flux = flux_dn * np.array([1.0, ratio])
-    found = pulls_on(pair, magnitude, flux, image_model(noise_dn))
-    return found.pull_px, found.uncertain_px, found.swamped
+    return pulls_on(pair, magnitude, np.array(flux_dn), image_model(noise_dn))
 
 
 @pytest.mark.parametrize('flux_dn', [500.0, 20000.0])
 @pytest.mark.parametrize('ratio', [0.01, 0.1, 0.45])
 @pytest.mark.parametrize('distance_px', [0.5, 1.0, 2.0, 3.0, 4.0, 5.0])
-def test_the_pull_of_a_neighbour_is_that_of_the_fit(
-    flux_dn: float, ratio: float, distance_px: float
-) -> None:
+def test_the_pull_of_a_neighbour_is_that_of_the_fit(flux_dn, ratio, distance_px) -> None:
     pull_px, sigma_px, measured_dn = pull_of_a_neighbour(flux_dn, ratio, distance_px, 2.1)
-    found, _, _ = pulls(measured_dn, ratio, distance_px, 2.1)
+    found = pulls(ratio, distance_px, [measured_dn, ratio * measured_dn], 2.1).pull_px
     # How much of the neighbour is in the flux is told to a part of it; either fit ends within
     # three hundredths of its sigma.
     assert found[0, 0] == pytest.approx(pull_px, rel=0.12, abs=0.06 * sigma_px)
@@ -90,10 +85,12 @@ def test_what_is_left_of_a_pull_that_is_let_pass_is_under_its_sigma() -> None:
                 pull_px, sigma_px, measured_dn = pull_of_a_neighbour(
                     flux_dn, ratio, distance_px, noise_dn
                 )
-                found, uncertain, swamped = pulls(measured_dn, ratio, distance_px, noise_dn)
-                if not (swamped[0] or uncertain[0, 0] > MAX_BLEND_SIGMA * sigma_px):
-                    told_px = np.hypot(sigma_px, uncertain[0, 0])
-                    worst = max(worst, abs(pull_px - found[0, 0]) / told_px)
+                both_dn = [measured_dn, ratio * measured_dn]
+                found = pulls(ratio, distance_px, both_dn, noise_dn)
+                uncertain_px = found.uncertain_px[0, 0]
+                if not (found.swamped[0] or uncertain_px > MAX_BLEND_SIGMA * sigma_px):
+                    told_px = np.hypot(sigma_px, uncertain_px)
+                    worst = max(worst, abs(pull_px - found.pull_px[0, 0]) / told_px)
     # The colour of the neighbour, which the uncertainty is for, is not in this.
     assert worst < 0.3
 
@@ -102,10 +99,7 @@ def test_what_is_left_of_a_pull_that_is_let_pass_is_under_its_sigma() -> None:
 def test_of_two_stars_that_look_like_one_the_centre_of_light_is_measured(ratio: float) -> None:
     distance_px = 0.1 * SIGMA_PX
     # What is measured is the flux of both.
-    total = 2000.0 * np.array([1.0 + ratio, 1.0 + ratio])
-    pair = np.array([[16.0, 16.0], [16.0 + distance_px, 16.0]])
-    magnitude = np.array([5.0, 5.0 - 2.5 * np.log10(ratio)])
-    found = pulls_on(pair, magnitude, total, image_model(2.1)).pull_px
+    found = pulls(ratio, distance_px, [2000.0 * (1.0 + ratio)] * 2, 2.1).pull_px
     # To first order in the distance; the second is (distance / sigma)^2, 1 %.
     assert found[0, 0] == pytest.approx(ratio / (1.0 + ratio) * distance_px, rel=0.02)
 

@@ -3,18 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import functools
 
 from geometries import turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from sample_sky import errors_sigma, exposure_of, true_px, with_planets  # type: ignore[import-not-found]
+from sample_sky import errors_sigma, exposure_of, true_px, with_pixels, with_planets  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation.rendering import render
-from starcal_ground.simulation.scenario import Detector, scenario, Scene
+from starcal_ground.simulation.scenario import Detector, Scenario, scenario, Scene
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import (
     Exposure,
@@ -22,39 +21,36 @@ from starcal_ros.identification.star_finder import (
     observe_stars,
     StarSearch,
 )
-from starcal_ros.records import CameraGeometry, Image, STAR_REFUSALS, StarObservations
-from starcal_ros.sky.catalog import load_catalog, StarCatalog
+from starcal_ros.records import CameraGeometry, STAR_REFUSALS, StarObservations
+from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.image_model import CentroidOptions
 
 SCENARIO = scenario('tiny', seed=6)
 TRUTH, PRIOR = SCENARIO.truth, SCENARIO.prior
-OPTIONS, CENTROIDS = IdentificationOptions(), CentroidOptions()
+CATALOG = load_catalog(None, IdentificationOptions().magnitude_limit)
+SEARCH = StarSearch(CATALOG)
 
 
 @functools.cache
-def catalog() -> StarCatalog:
-    return load_catalog(None, OPTIONS.magnitude_limit)
-
-
-@functools.cache
-def shown(index: int) -> tuple[Scene, Image]:
+def shown(index: int) -> tuple[Scene, Exposure]:
     one, exposure = exposure_of(SCENARIO, index)
-    return one, exposure.image
+    return one, exposure
 
 
 def observed(
-    image: Image,
-    icrf_from_star_tracker_xyzw: np.ndarray,
-    geometry: CameraGeometry = PRIOR,
-    options: IdentificationOptions = OPTIONS,
+    exposure: Exposure, geometry: CameraGeometry = PRIOR, search: StarSearch = SEARCH
 ) -> StarObservations:
-    exposure = Exposure(image, icrf_from_star_tracker_xyzw, 0.5)
-    return observe_stars(exposure, geometry, StarSearch(catalog(), CENTROIDS, options))[0]
+    return observe_stars(exposure, geometry, search)[0]
 
 
-def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
+def drawn(one: Scene, index: int, scenario: Scenario = SCENARIO) -> Exposure:
+    """The exposure of a campaign with another scene before the camera."""
+    return dataclasses.replace(shown(index)[1], image=render(scenario, one, index))
+
+
+def assert_right(found: StarObservations, one: Scene) -> None:
     """Assert that every star is at the pixel of its catalog number."""
-    assert found.refusal == '' and len(found) >= least
+    assert found.refusal == '' and len(found) >= 100
     in_sigma = np.abs(errors_sigma(one, found))
     assert np.isfinite(in_sigma).all()
     # Several hundred normal deviates, some of them pulled by a faint neighbour: a wrong star is
@@ -66,12 +62,12 @@ def assert_right(found: StarObservations, one: Scene, least: int = 100) -> None:
 
 @pytest.mark.parametrize('index', [0, 3, 6, 9])
 def test_every_star_is_the_right_one(index: int) -> None:
-    one, image = shown(index)
-    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    one, exposure = shown(index)
+    found = observed(exposure)
     assert_right(found, one)
     assert found.psf_sigma_px == pytest.approx(SCENARIO.detector.psf_sigma_px, rel=0.02)
-    assert found.catalog_digest == catalog().digest
-    assert found.time_ns == image.time_ns
+    assert found.catalog_digest == CATALOG.digest
+    assert found.time_ns == exposure.image.time_ns
     magnitude = dict(zip(one.catalog_id.tolist(), one.magnitude, strict=True))
     expected = [magnitude[number] for number in found.catalog_id]
     np.testing.assert_allclose(found.magnitude, expected, rtol=1e-6)
@@ -82,35 +78,31 @@ def test_every_star_is_the_right_one(index: int) -> None:
     ('index', 'tilt_deg', 'roll_deg'),
     [(0, 0.1, -4.9), (4, 0.7, 0.0), (8, 1.45, 4.9), (4, 1.45, -4.9), (0, 1.45, 0.0)],
 )
-def test_an_alignment_that_launch_has_turned_is_acquired(
-    index: int, tilt_deg: float, roll_deg: float
-) -> None:
+def test_an_alignment_that_launch_has_turned_is_acquired(index, tilt_deg, roll_deg) -> None:
     angle = np.random.default_rng(index).uniform(0, 2 * np.pi)
     axis = np.array([np.cos(angle), np.sin(angle), 0.0])
     turn = Rotation.from_rotvec(np.radians(tilt_deg) * axis) * Rotation.from_rotvec(
         [0.0, 0.0, np.radians(roll_deg)]
     )
-    one, image = shown(index)
-    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn)), one)
+    one, exposure = shown(index)
+    assert_right(observed(exposure, turned(PRIOR, turn)), one)
 
 
 @pytest.mark.parametrize(('index', 'scale'), [(1, 0.98), (4, 1.02)])
 def test_a_focal_length_two_percent_off_is_acquired(index: int, scale: float) -> None:
     fx, _, fy, _, _ = PRIOR.camera.intrinsics
     camera = PRIOR.camera.replace(fx=scale * fx, fy=scale * fy)
-    prior = dataclasses.replace(PRIOR, camera=camera)
-    one, image = shown(index)
-    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, prior), one)
+    one, exposure = shown(index)
+    assert_right(observed(exposure, dataclasses.replace(PRIOR, camera=camera)), one)
 
 
 def test_a_wrong_attitude_never_matches() -> None:
     # Anywhere in the sky: that one of 40 comes within 1.5 degrees is a chance of 0.01.
     for index in range(4):
-        _, image = shown(index)
         for seed in range(10):
             attitude = Rotation.random(random_state=100 * index + seed).as_quat()
             with pytest.raises(ImageRefused) as refusal:
-                observed(image, attitude)
+                observed(Exposure(shown(index)[1].image, attitude, 0.5))
             assert refusal.value.reason == 'no_match'
 
 
@@ -119,14 +111,13 @@ def test_hot_pixels_and_missing_and_strange_stars() -> None:
     rng = np.random.default_rng(7)
     seen = rng.uniform(size=len(one.catalog_id)) < 0.6
     strange = rng.uniform([0, 0], [639, 511], (40, 2))
-    drawn = dataclasses.replace(
+    other = dataclasses.replace(
         one,
         pixel_px=np.concatenate([one.pixel_px[seen], strange]),
         flux_electrons=np.concatenate([one.flux_electrons[seen], 10 ** rng.uniform(3, 4.5, 40)]),
     )
     detector = dataclasses.replace(SCENARIO.detector, hot_fraction=5e-3, cosmic_rays=20.0)
-    image = render(dataclasses.replace(SCENARIO, detector=detector), drawn, 1)
-    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    found = observed(drawn(other, 1, dataclasses.replace(SCENARIO, detector=detector)))
     # Hardly any star that was not drawn is found: one of the strange ones stands in its place.
     missing = set(one.catalog_id[~seen].tolist())
     assert sum(number in missing for number in found.catalog_id.tolist()) <= 1
@@ -138,9 +129,9 @@ def test_hot_pixels_and_missing_and_strange_stars() -> None:
 @pytest.mark.parametrize(('index', 'turn_deg'), [(0, 0.0), (4, 0.0), (2, 1.0), (7, 1.0)])
 def test_planets_are_no_stars(index: int, turn_deg: float) -> None:
     one, _ = shown(index)
-    image = render(SCENARIO, with_planets(SCENARIO, one, index), index)
+    exposure = drawn(with_planets(SCENARIO, one, index), index)
     turn = Rotation.from_rotvec(np.radians(turn_deg) * np.array([0.6, -0.8, 2.0]))
-    assert_right(observed(image, one.icrf_from_star_tracker_xyzw, turned(PRIOR, turn)), one)
+    assert_right(observed(exposure, turned(PRIOR, turn)), one)
 
 
 def reasons(found: StarObservations) -> dict[int, str]:
@@ -151,7 +142,6 @@ def reasons(found: StarObservations) -> dict[int, str]:
 
 
 def moved_right(pixels: np.ndarray, u: int, v: int, shift: int) -> None:
-    """Shift the light around a pixel to the right."""
     window = slice(v - 7, v + 8), slice(u - 7, u + 8)
     pixels[window] = np.roll(pixels[window], shift, axis=1)
 
@@ -173,25 +163,18 @@ def sharpened(pixels: np.ndarray, u: int, v: int) -> None:
         ('too_few_pixels', 'moment', sharpened),
     ],
 )
-def test_one_spoilt_star_is_left_out_by_its_reason(
-    reason: str, centroid: str, spoil: Callable[..., None]
-) -> None:
-    one, image = shown(0)
-    options = CentroidOptions(centroid=centroid)
-
-    def seen(pixels: np.ndarray) -> StarObservations:
-        exposure = Exposure(Image(image.time_ns, pixels), one.icrf_from_star_tracker_xyzw, 0.5)
-        return observe_stars(exposure, PRIOR, StarSearch(catalog(), options))[0]
-
-    before = seen(image.pixels)
+def test_one_spoilt_star_is_left_out_by_its_reason(reason, centroid, spoil) -> None:
+    one, exposure = shown(0)
+    search = StarSearch(CATALOG, CentroidOptions(centroid=centroid))
+    before = observed(exposure, PRIOR, search)
     apart = np.linalg.norm(one.pixel_px[:, None] - one.pixel_px[None], axis=-1)
     np.fill_diagonal(apart, np.inf)
     alone = set(one.catalog_id[apart.min(axis=1) > 15.0].tolist())
     brightest = next(k for k in np.argsort(-before.flux_dn) if before.catalog_id[k] in alone)
     star = int(before.catalog_id[brightest])
-    pixels = image.pixels.copy()
+    pixels = exposure.image.pixels.copy()
     spoil(pixels, *np.rint(before.measured_px[brightest]).astype(int).tolist())
-    after = seen(pixels)
+    after = observed(with_pixels(exposure, pixels), PRIOR, search)
     # Those at a limit may change from one refusal to another, as the noise is found anew.
     fell_out = {
         number: why for number, why in reasons(after).items() if number not in reasons(before)
@@ -215,20 +198,16 @@ def noise(sky: np.ndarray, seed: int) -> np.ndarray:
     ],
     ids=['dark', 'bright', *map('noise {}'.format, range(2)), 'mirrored'],
 )
-def test_an_image_without_the_stars_matches_nothing(
-    made_of: Callable[[np.ndarray], np.ndarray], refusals: list[str]
-) -> None:
-    one, image = shown(1)
+def test_an_image_without_the_stars_matches_nothing(made_of, refusals) -> None:
+    _, exposure = shown(1)
     with pytest.raises(ImageRefused) as refusal:
-        observed(Image(image.time_ns, made_of(image.pixels)), one.icrf_from_star_tracker_xyzw)
+        observed(with_pixels(exposure, made_of(exposure.image.pixels)))
     assert refusal.value.reason in refusals
 
 
 def test_too_few_stars_are_refused() -> None:
-    one, image = shown(0)
-    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
-    search = StarSearch(catalog(), CentroidOptions(min_snr=400.0))
-    refused, _ = observe_stars(exposure, PRIOR, search)
+    search = StarSearch(CATALOG, CentroidOptions(min_snr=400.0))
+    refused = observed(shown(0)[1], PRIOR, search)
     assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
     assert ' stars measured, ' in refused.detail
     # What became of the others is told all the same.
@@ -236,8 +215,8 @@ def test_too_few_stars_are_refused() -> None:
 
 
 def test_refused_stars_are_told_with_their_places() -> None:
-    one, image = shown(0)
-    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    one, exposure = shown(0)
+    found = observed(exposure)
     assert not set(found.refused_catalog_id) & set(found.catalog_id)
     counted = {reason: len(places) for reason, places in found.refused_places().items()}
     assert counted == found.refused_stars and {'blend', 'faint'} <= set(counted)
@@ -245,16 +224,12 @@ def test_refused_stars_are_told_with_their_places() -> None:
     assert np.abs(found.refused_px - true_px(one, found.refused_catalog_id)).max() < 0.5
 
 
-def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    one, image = shown(2)
-    marked = dataclasses.replace(catalog(), close_pair=np.ones(len(catalog()), bool))
-    before = observed(image, one.icrf_from_star_tracker_xyzw)
-    exposure = Exposure(image, one.icrf_from_star_tracker_xyzw, 0.5)
-    after, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
+def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(monkeypatch) -> None:
+    _, exposure = shown(2)
+    marked = StarSearch(dataclasses.replace(CATALOG, close_pair=np.ones(len(CATALOG), bool)))
+    before, after = observed(exposure), observed(exposure, PRIOR, marked)
     monkeypatch.setattr('starcal_ros.identification.blending.MAX_BLEND_SIGMA', 0.1)
-    fewer, _ = observe_stars(exposure, PRIOR, StarSearch(marked, CENTROIDS))
+    fewer = observed(exposure, PRIOR, marked)
     assert fewer.refused_stars['blend'] > after.refused_stars['blend']
     both, i, j = np.intersect1d(before.catalog_id, after.catalog_id, return_indices=True)
     more_px2 = after.covariance_px2[j] - before.covariance_px2[i]
@@ -263,15 +238,12 @@ def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(
     np.testing.assert_array_equal(after.measured_px[j], before.measured_px[i])
 
 
-def test_an_unknown_proper_motion_is_in_the_covariance(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_proper_motion_is_in_the_covariance() -> None:
     """Ten years of the usual motion in a camera of 100 arcsec a pixel, and nothing else."""
-    one, image = shown(0)
-    moved = observed(image, one.icrf_from_star_tracker_xyzw)
-    known = catalog()
-    unmoved = dataclasses.replace(known, motion_source=np.zeros_like(known.motion_source))
-    monkeypatch.setitem(globals(), 'catalog', lambda: unmoved)
-    still = observed(image, one.icrf_from_star_tracker_xyzw)
-    row = {number: k for k, number in enumerate(known.id.tolist())}
+    _, exposure = shown(0)
+    unmoved = dataclasses.replace(CATALOG, motion_source=np.zeros_like(CATALOG.motion_source))
+    moved, still = observed(exposure), observed(exposure, PRIOR, StarSearch(unmoved))
+    row = {number: k for k, number in enumerate(CATALOG.id.tolist())}
     sigma_rad = unmoved.place_sigma_rad(np.array([row[n] for n in still.catalog_id]), 2026.4)
     more_px2 = np.outer((sigma_rad * PRIOR.camera.parameters[0]) ** 2, [1.0, 0.0, 1.0])
     assert still.measured_px.tolist() == moved.measured_px.tolist()
@@ -284,14 +256,13 @@ def test_stars_with_an_unknown_companion_are_told_by_their_shape() -> None:
     one, _ = shown(4)
     bright = one.flux_electrons > 3000
     companion = one.pixel_px[bright] + np.array([2.4, 1.8])
-    drawn = dataclasses.replace(
+    other = dataclasses.replace(
         one,
         pixel_px=np.concatenate([one.pixel_px, companion]),
         flux_electrons=np.concatenate([one.flux_electrons, 0.5 * one.flux_electrons[bright]]),
     )
     quiet = Detector(cosmic_rays=0.0, hot_fraction=0.0, electrons_per_dn=8.0, offset_dn=32.0)
-    image = render(dataclasses.replace(SCENARIO, detector=quiet), drawn, 4)
-    found = observed(image, one.icrf_from_star_tracker_xyzw)
+    found = observed(drawn(other, 4, dataclasses.replace(SCENARIO, detector=quiet)))
     doubled = set(one.catalog_id[bright].tolist())
     kept = [number in doubled for number in found.catalog_id.tolist()]
     assert len(doubled) > 10 and np.count_nonzero(kept) <= 2

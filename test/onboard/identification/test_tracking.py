@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from sample_sky import errors_sigma, exposure_of, started, with_planets  # type: ignore[import-not-found]
 from sample_sky import tracked as tracked_campaign
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from bench import narrow
@@ -102,19 +101,14 @@ def test_a_background_cut_off_at_zero_makes_no_star_look_certain() -> None:
         )
         dark = dataclasses.replace(given, detector=detector)
         for one, observations, _ in tracked_campaign(dark, range(10), StarSearch(CATALOG)):
-            apart_px, nearest = cKDTree(one.pixel_px).query(observations.measured_px)
-            assert apart_px.max() < 3.0
-            sigma_px = np.sqrt(observations.covariance_px2[:, [0, 2]])
-            errors.append((observations.measured_px - one.pixel_px[nearest]) / sigma_px)
+            errors.append(errors_sigma(one, observations))
     of_sigma = np.concatenate(errors)
     # 1,500 errors tell their RMS to 0.018.  A Gaussian for a PSF of half a pixel costs 0.04; with
     # the small scatter of the pixels at 0 DN it was 1.13.
     assert float(np.sqrt((of_sigma**2).mean())) < 1.09
 
 
-def test_stars_left_out_as_too_faint_are_listed_as_refused(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_stars_left_out_as_too_faint_are_listed_as_refused(monkeypatch) -> None:
     whole, _ = searched(1)
     used = np.flatnonzero(np.isin(CATALOG.id, whole.catalog_id))
     refused = np.flatnonzero(np.isin(CATALOG.id, whole.refused_catalog_id))
@@ -316,9 +310,7 @@ def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> 
         _, track = track_stars(exposed(SHARP, index, detector)[1], track, SEARCH)
 
 
-def test_streaks_of_which_too_few_are_alone_are_searched_again(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_streaks_of_which_too_few_are_alone_are_searched_again(monkeypatch) -> None:
     _, track = searched(1)
     monkeypatch.setattr('starcal_ros.stars.image_model._ISOLATED_PX', 1000.0)
     with pytest.raises(ImageRefused, match='too few of them are alone') as refused:

@@ -75,12 +75,6 @@ def test_faint_stars_are_seen() -> None:
     assert picture[10, 10] == 240 or picture[10, 10] == 255
 
 
-def test_refused_image_says_why() -> None:
-    image = Image(0, np.zeros((120, 200), np.uint8))
-    picture = annotate(image, refused_image(0, 200, 120, 'no_match', 'three'), GEOMETRY)
-    assert (picture[..., 2].astype(int) - picture[..., 1]).max() > 100  # red letters
-
-
 def test_predictions_far_outside_are_drawn_over() -> None:
     behind = dataclasses.replace(
         two_stars(), direction_icrf=np.array([[0, 0, -1.0], [1, 0, 1e-9]])
@@ -111,7 +105,7 @@ def test_refused_stars_are_marked_by_reason() -> None:
     assert not (picture == STAR_MARKS['saturated'].color).all(axis=2).any()
 
 
-def test_a_long_refusal_is_wrapped() -> None:
+def test_a_refusal_is_in_red_and_wrapped_where_it_is_long() -> None:
     image = Image(0, np.zeros((120, 200), np.uint8))
     short, long = (
         annotate(image, refused_image(0, 200, 120, 'no_match', text), GEOMETRY)

@@ -82,19 +82,12 @@ def test_from_the_ground_stars_are_where_the_air_puts_them(camera_yaml: Path) ->
     assert np.degrees(np.median(elevation_rad)) == pytest.approx(20.0, abs=2.0)
     moved_px = pixel_px - drawn.pixel_px
     assert np.linalg.norm(moved_px, axis=1).min() > 0.5 and np.ptp(moved_px, axis=0).max() > 1.0
-    place = {
-        number: (pixel, direction)
-        for number, pixel, direction in zip(
-            drawn.catalog_id.tolist(), pixel_px, bent_icrf, strict=True
-        )
-    }
     assert found.refusal == '' and len(found) > 100
-    uu, _, vv = found.covariance_px2.T
-    off_px = found.measured_px - [place[number][0] for number in found.catalog_id.tolist()]
-    in_sigma = off_px / np.sqrt(np.stack([uu, vv], axis=-1))
+    in_sigma = errors_sigma(dataclasses.replace(drawn, pixel_px=pixel_px), found)
     assert np.sqrt((in_sigma**2).mean()) < 1.2  # as of stars in space
     # What is recorded is the bent direction, so that a calibration from the record is the same.
-    recorded = [place[number][1] for number in found.catalog_id.tolist()]
+    bent = dict(zip(drawn.catalog_id.tolist(), bent_icrf, strict=True))
+    recorded = [bent[number] for number in found.catalog_id.tolist()]
     np.testing.assert_allclose(found.direction_icrf, recorded, rtol=0, atol=1e-12)
     zenith_icrf, refraction_arcsec = air_above(drawn.time_ns, made.site)
     np.testing.assert_array_equal(found.zenith_icrf, zenith_icrf)
@@ -214,9 +207,7 @@ def test_images_of_recordings_without_digests_are_told_apart_by_their_stamps() -
     assert len(ensemble.images) == 3
 
 
-def test_a_refused_image_does_not_put_those_after_it_out_of_order(
-    setup: Setup,
-) -> None:
+def test_a_refused_image_does_not_put_those_after_it_out_of_order(setup) -> None:
     track = observe.Track(setup.prior)
     future = dataclasses.replace(image(2), time_ns=image().time_ns + 10**15)
     refused, track = observe.observe_next(future, attitudes(), setup, track)
@@ -288,9 +279,7 @@ def test_a_dark_frame_of_a_byte(camera_yaml: Path, tmp_path: Path) -> None:
     assert byte.refusal == '' and byte.background_dn == pytest.approx(7.0, abs=0.2)
 
 
-def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
-    setup: Setup,
-) -> None:
+def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(setup) -> None:
     """One is put under a star of the third image: bright or dim, the star is left out for it."""
     track = observe.Track(setup.prior)
     held = attitudes(1, 2, 3)
@@ -310,9 +299,7 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(
     assert [list(found.refused_stars)[code] for code in reason] == ['hot_pixel']
 
 
-def test_a_saturated_star_is_known_as_such_under_a_dark_frame(
-    camera_yaml: Path, tmp_path: Path
-) -> None:
+def test_a_saturated_star_is_known_as_such_under_a_dark_frame(camera_yaml, tmp_path) -> None:
     """What the dark frame takes away must not hide that the converter was at its end."""
     dark = np.random.default_rng(4).normal(32.0, 2.0, image().pixels.shape).astype(np.uint16)
     path = write_png(tmp_path / 'dark.png', dark)
@@ -395,10 +382,7 @@ def test_the_rate_of_a_further_star_tracker_is_about_the_axes_of_the_first() -> 
     ],
 )
 def test_the_sigma_of_the_velocity_is_recorded(
-    camera_yaml: Path,
-    others: dict[str, object],
-    measured_m_s: list[float] | None,
-    sigma_m_s: float,
+    camera_yaml, others, measured_m_s, sigma_m_s
 ) -> None:
     """Of used and of refused images; a message stands before the constant of the options."""
     setup = load_setup(values(camera_yaml, **others))

@@ -56,9 +56,7 @@ def test_a_setup_holds_what_the_parameters_say(camera_yaml: Path) -> None:
     np.testing.assert_array_equal(made.prior.camera.parameters, SCENARIO.prior.camera.parameters)
 
 
-def test_another_lens_model_starts_from_the_prior_camera(
-    camera_yaml: Path, tmp_path: Path
-) -> None:
+def test_another_lens_model_starts_from_the_prior_camera(camera_yaml, tmp_path) -> None:
     wide = load_setup(values(camera_yaml, lens_model='rational_polynomial'))
     prior = wide.prior.camera
     assert prior.model == 'rational_polynomial'
@@ -77,9 +75,7 @@ def test_a_rounded_alignment_is_made_unit(camera_yaml: Path) -> None:
     assert np.linalg.norm(made.prior.star_tracker_from_camera_xyzw) == pytest.approx(1, abs=1e-15)
 
 
-def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
-    camera_yaml: Path, tmp_path: Path
-) -> None:
+def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(camera_yaml, tmp_path) -> None:
     """The nodes' QoS override, nested as ROS reads it, in the file that the tool reads too."""
     params = tmp_path / 'params.yaml'
     params.write_text(
@@ -123,9 +119,7 @@ def test_an_override_of_ros_in_a_parameter_file_is_not_an_option(
         ({'autstart': False}, 'autstart: no such parameter .did you mean autostart'),
     ],
 )
-def test_a_wrong_parameter_is_named(
-    camera_yaml: Path, wrong: dict[str, object], says: str
-) -> None:
+def test_a_wrong_parameter_is_named(camera_yaml, wrong, says) -> None:
     with pytest.raises(OptionError, match=says):
         load_setup(values(camera_yaml, **wrong))
 
@@ -257,9 +251,7 @@ def test_pixels_without_response_or_with_a_current_are_bad(
     assert (corrected.pixels == image().pixels).all()
 
 
-def test_the_dust_and_noise_of_a_flat_field_are_no_stars(
-    camera_yaml: Path, tmp_path: Path
-) -> None:
+def test_the_dust_and_noise_of_a_flat_field_are_no_stars(camera_yaml, tmp_path) -> None:
     """Specks of dust, rows of other gain and vignetting, with the noise of the photons."""
     v, u = np.mgrid[:HEIGHT, :WIDTH]
     flat = response()
@@ -285,21 +277,15 @@ def test_saturated_pixels_stay_at_the_peak() -> None:
         ('dark_frame', np.zeros((HEIGHT, WIDTH - 1), np.uint16), 'one channel of 640 x 512'),
         ('dark_frame', np.zeros((HEIGHT, WIDTH, 3), np.uint8), 'one channel of 640 x 512'),
         ('dark_frame', np.zeros((HEIGHT, WIDTH), np.float32), 'one channel of 640 x 512'),
-        ('dark_frame', None, r'dark_frame: .*map.png: no such file'),
         ('flat_field', np.ones((HEIGHT, WIDTH - 1), np.uint8), 'one channel of 640 x 512'),
         ('flat_field', np.zeros((HEIGHT, WIDTH), np.uint8), 'median is .*not positive'),
         ('flat_field', image().pixels, 'shows [0-9]+ stars: it is a frame of the sky'),
         ('bad_pixel_map', np.zeros((3, 4), np.uint8), 'one channel of 640 x 512'),
         ('bad_pixel_map', np.ones((HEIGHT, WIDTH), np.uint8), 'marks 100% .* 0 for good pixels'),
-        ('bad_pixel_map', None, 'bad_pixel_map: .*map.png: no such file'),
     ],
 )
-def test_a_file_that_does_not_fit_is_named(
-    camera_yaml: Path, tmp_path: Path, name: str, content: np.ndarray | None, words: str
-) -> None:
-    is_float = content is not None and content.dtype == np.float32
-    path = tmp_path / ('map.tiff' if is_float else 'map.png')
-    if content is not None:
-        cv2.imwrite(str(path), content)
+def test_a_file_that_does_not_fit_is_named(camera_yaml, tmp_path, name, content, words) -> None:
+    path = tmp_path / ('map.tiff' if content.dtype == np.float32 else 'map.png')
+    cv2.imwrite(str(path), content)
     with pytest.raises(OptionError, match=words):
         load_setup(values(camera_yaml, **{name: str(path)}))

@@ -241,14 +241,6 @@ def test_digests_can_be_stopped(tmp_path: Path) -> None:
     assert inputs_of([file])[str(file)] == f'sha256:{hashlib.sha256(bytes(3 << 20)).hexdigest()}'
 
 
-def with_lens(model: str, **coefficients: float) -> Scenario:
-    """A campaign of a camera of a lens model, the prior of plumb_bob."""
-    given: Scenario = of_random_pointings(5, images=6)
-    camera, _ = convert(given.truth.camera, model)
-    truth = dataclasses.replace(given.truth, camera=camera.replace(**coefficients))
-    return dataclasses.replace(given, truth=truth)
-
-
 KB97 = Path(__file__).parents[4] / 'shared/realsky/lco_kb97_observations'
 
 
@@ -297,10 +289,11 @@ def test_no_camera_fits_mirrored_noise() -> None:
         ('thin_prism', {'s1': 0.02, 's2': 0.3}, ('plumb_bob', 'thin_prism', 'tilted')),
     ],
 )
-def test_the_smallest_model_that_leaves_no_field_is_chosen(
-    model: str, coefficients: dict[str, float], chosen: tuple[str, ...]
-) -> None:
-    given = with_lens(model, **coefficients)
+def test_the_smallest_model_that_leaves_no_field_is_chosen(model, coefficients, chosen) -> None:
+    given: Scenario = of_random_pointings(5, images=6)
+    camera, _ = convert(given.truth.camera, model)
+    truth = dataclasses.replace(given.truth, camera=camera.replace(**coefficients))
+    given = dataclasses.replace(given, truth=truth)
     options = CalibrationOptions(
         star_tracker_sigma_arcsec=given.star_tracker_sigma_arcsec, velocity_sigma_m_s=10.0
     )

@@ -73,9 +73,7 @@ def used(records: list[StarObservations]) -> Counter[str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(('which', 'until'), [('first', 0.0), ('other', -1.0)])
-def test_one_that_falls_silent_or_repeats_itself_costs_no_image(
-    tmp_path: Path, which: str, until: float
-) -> None:
+def test_one_that_falls_silent_or_repeats_itself_costs_no_image(tmp_path, which, until) -> None:
     end: dict[str, Any] = {f'{which}_until': until}
     bag = bag_of(tmp_path / 'two', **end)
     records = observed(bag, setup_with())

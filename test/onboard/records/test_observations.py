@@ -11,15 +11,7 @@ import pytest
 from starcal_ros.assessment.lookup import Derivatives, line_of_sight_table
 from starcal_ros.camera import CameraModel, pixel_grid
 from starcal_ros.camera.detector_field import DetectorField, term_count
-from starcal_ros.records import (
-    Ensemble,
-    factored_field,
-    MapCovariance,
-    refused_image,
-    STAR_REFUSALS,
-    StarObservations,
-    StarRefusal,
-)
+from starcal_ros.records import factored_field, MapCovariance, STAR_REFUSALS, StarRefusal
 
 
 def test_codes_fit_their_arrays() -> None:
@@ -33,19 +25,11 @@ def test_names_ascend_with_their_codes() -> None:
     assert list(STAR_REFUSALS) == sorted(STAR_REFUSALS)
 
 
-def test_an_image_is_used_until_it_is_refused() -> None:
-    used = StarObservations.of_image(5, (640, 512), noise_dn=2.0)
-    assert (used.time_ns, used.width, used.height, used.noise_dn) == (5, 640, 512, 2.0)
-    assert used.refusal == used.detail == '' and len(used) == 0
-    refused = refused_image(5, 640, 512, 'no_match', 'three stars')
-    assert (refused.refusal, refused.detail) == ('no_match', 'three stars')
-    assert Ensemble().add(used).images and not Ensemble().add(refused).images
-
-
 OCTAVES = 3
 TERMS = term_count(1296, 1024, OCTAVES)
 LENS = CameraModel(1296, 1024, np.array([3641.5, -0.7, 3642.3, 647.5, 511.5, -0.05, 0.1, 0, 0, 0]))
-CAMERA = dataclasses.replace(LENS, field=DetectorField(1296, 1024, OCTAVES, np.zeros((2, TERMS))))
+FIELD = DetectorField(1296, 1024, OCTAVES, np.zeros((2, TERMS)))
+CAMERA = dataclasses.replace(LENS, field=FIELD)
 SIGMA = np.r_[0.3, 0.1, 0.3, 0.5, 0.5, 1e-3, 1e-2, 1e-1, 1e-4, 1e-4, np.full(3, 2e-5)]
 
 
@@ -65,8 +49,7 @@ def covariance(stars: int, held: bool = False) -> MapCovariance:
 @pytest.mark.parametrize('held', [False, True], ids=['free', 'held'])
 def test_every_sigma_of_a_line_of_sight_holds_to_a_thousandth(stars: int, held: bool) -> None:
     given = covariance(stars, held)
-    assert CAMERA.field is not None
-    record = factored_field(CAMERA.field, given)
+    record = factored_field(FIELD, given)
     pixels = pixel_grid(CAMERA, 61, 47)
     expected = line_of_sight_table(CAMERA, given, pixels)
     found = line_of_sight_table(
@@ -96,16 +79,14 @@ def test_a_direction_of_little_variance_is_kept() -> None:
 
 
 def test_the_record_is_a_quarter_of_the_square() -> None:
-    assert CAMERA.field is not None
-    record = factored_field(CAMERA.field, covariance(300))
+    record = factored_field(FIELD, covariance(300))
     numbers = (record.covariance_factor, record.remainder_unit_px, record.remainder)
     square = record.covariance.nbytes
     assert sum(one.nbytes for one in numbers) < 0.25 * square
 
 
 def test_a_field_without_variance_has_none() -> None:
-    assert CAMERA.field is not None
     matrix = np.zeros((13 + 2 * TERMS,) * 2)
     matrix[:13, :13] = np.diag(SIGMA**2)
-    record = factored_field(CAMERA.field, MapCovariance(matrix))
+    record = factored_field(FIELD, MapCovariance(matrix))
     np.testing.assert_allclose(record.covariance, matrix, rtol=1e-8, atol=1e-30)

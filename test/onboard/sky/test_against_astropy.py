@@ -61,9 +61,9 @@ def random_stars(count: int) -> StarCatalog:
     )
 
 
-def places(stars: StarCatalog, time: Time) -> SkyCoord:
-    """Stars of a catalog as astropy coordinates at a time."""
-    at_epoch = SkyCoord(
+def places(stars: StarCatalog) -> SkyCoord:
+    """Stars of a catalog as astropy coordinates."""
+    return SkyCoord(
         ra=stars.ra_rad * u.rad,
         dec=stars.dec_rad * u.rad,
         pm_ra_cosdec=stars.pm_ra_cosdec_rad_per_year * u.rad / u.yr,
@@ -72,26 +72,12 @@ def places(stars: StarCatalog, time: Time) -> SkyCoord:
         obstime=Time(2016.0, format='jyear', scale='tcb'),
         frame=ICRS(),
     )
-    return at_epoch.apply_space_motion(new_obstime=time)
 
 
 def unit_vectors(coordinates: SkyCoord) -> np.ndarray:
     """Directions (n, 3) along the axes of the coordinates' own frame."""
     xyz = np.moveaxis(coordinates.cartesian.xyz.value, 0, -1)
     return np.asarray(xyz / np.linalg.norm(xyz, axis=1, keepdims=True))
-
-
-@pytest.mark.parametrize('time_s', TIMES_S)
-def test_agrees_with_astropy_gcrs(time_s):
-    stars = random_stars(500)
-    time = Time(time_s, format='unix', scale='utc')
-    expected = unit_vectors(places(stars, time).transform_to(GCRS(obstime=time)))
-    ours = apparent_directions(stars, time_s * NANOSECONDS_PER_SECOND)
-    away_mas = np.linalg.norm(ours - expected, axis=1) / MAS_RAD
-    # astropy leaves out the light time across the Earth's orbit, 500 s of motion: 0.16 mas for
-    # Barnard's star.  Everything else is the same theory.
-    assert away_mas.max() < 0.2
-    assert np.median(away_mas) < 0.01
 
 
 SITES = [
@@ -109,7 +95,7 @@ def test_the_air_bends_light_as_in_astropy(site: SiteOptions, time_s: int) -> No
     place = EarthLocation.from_geodetic(
         site.longitude_deg * u.deg, site.latitude_deg * u.deg, site.height_m * u.m
     )
-    at_time = places(stars, time)
+    at_time = places(stars).apply_space_motion(new_obstime=time)
     position, velocity = place.get_gcrs_posvel(time)
     # Without air, along axes of the ICRF and along those of the horizon: what turns the one to
     # the other is the rotation that refraction is not part of.

@@ -68,16 +68,10 @@ def test_interpolation_is_slerp(seed: int, t: float) -> None:
 def test_both_directions_mean_one_rotation() -> None:
     q = random_quaternions(1, 1)[0]
     inverse = Rotation.from_quat(q).inv().as_quat()
-    direct = attitude_sample(START_NS, q, 'st_to_inertial')
-    other = attitude_sample(START_NS, inverse, 'inertial_to_st')
-    assert direct is not None and other is not None
-    v = np.array([0.3, -0.5, 0.8])
-    of_direct, of_other = (
-        Rotation.from_quat(sample.icrf_from_star_tracker_xyzw).apply(v)
-        for sample in (direct, other)
-    )
-    np.testing.assert_allclose(of_direct, Rotation.from_quat(q).apply(v), rtol=0, atol=1e-15)
-    np.testing.assert_allclose(of_other, of_direct, rtol=0, atol=1e-15)
+    for sent, direction in ((q, 'st_to_inertial'), (inverse, 'inertial_to_st')):
+        sample = attitude_sample(START_NS, sent, direction)
+        assert sample is not None
+        assert angle_between(sample.icrf_from_star_tracker_xyzw, q) < 1e-15
 
 
 @pytest.mark.parametrize(
@@ -151,11 +145,7 @@ def test_a_sample_at_the_image_needs_no_other() -> None:
     ],
 )
 def test_samples_that_give_no_attitude_are_named(
-    valid_s: tuple[int, ...],
-    invalid_s: tuple[int, ...],
-    at_s: float,
-    max_gap_s: float,
-    reason: str,
+    valid_s, invalid_s, at_s, max_gap_s, reason
 ) -> None:
     quaternions = random_quaternions(11, len(valid_s))
     held = history([(START_NS + t * S, q) for t, q in zip(valid_s, quaternions, strict=True)])
@@ -264,7 +254,7 @@ def turning(rate_rad_s: np.ndarray, at_s: tuple[float, ...]) -> AttitudeHistory:
 
 
 def test_the_rate_is_that_about_the_own_axes() -> None:
-    """Also at a sample's own stamp, where a node has no later one yet."""
+    """Also at a sample's own stamp, where a node has no later one yet, and of 500 a second."""
     rate_rad_s = np.array([0.01, -0.03, 0.02])
     held = turning(rate_rad_s, (0.0, 0.5, 1.0, 2.5))
     for t in (0.1, 0.5, 0.9, 1.0, 1.8, 2.5):
@@ -272,6 +262,10 @@ def test_the_rate_is_that_about_the_own_axes() -> None:
         np.testing.assert_allclose(found, rate_rad_s, atol=1e-9)
         # Of two samples, a line through three: nothing shows how they scatter.
         assert (sigma >= SIGMA_RAD / np.sqrt(2.0)).all()
+    fast = turning(rate_rad_s, tuple(np.arange(-1.2, 1.2, 0.002)))
+    assert len(fast) == 1200
+    found, _ = fast.rate_at(START_NS, 2.0, SIGMA_RAD)
+    np.testing.assert_allclose(found, rate_rad_s, atol=1e-9)
 
 
 ARC_10_HZ = tuple(np.arange(-0.95, 1.0, 0.1))
@@ -291,9 +285,7 @@ ARC_10_HZ = tuple(np.arange(-0.95, 1.0, 0.1))
         ((-0.3, 0.1, 0.9), 0.0, 0.6, 1.2),
     ],
 )
-def test_the_sigma_of_a_rate_is_its_scatter(
-    at_s: tuple[float, ...], memory_s: float, low: float, high: float
-) -> None:
+def test_the_sigma_of_a_rate_is_its_scatter(at_s, memory_s, low, high) -> None:
     """Error over sigma, rms; the errors of samples may be correlated, and here mostly are not."""
     rng = np.random.default_rng(7)
     apart_s = np.abs(np.subtract.outer(at_s, at_s))
@@ -309,14 +301,6 @@ def test_the_sigma_of_a_rate_is_its_scatter(
         rate, sigma = held.rate_at(START_NS, 2.0, SIGMA_RAD)
         in_sigma.append((rate - rate_rad_s) / sigma)
     assert low < np.sqrt(np.mean(np.square(in_sigma))) < high
-
-
-def test_a_fast_star_tracker_has_its_rate() -> None:
-    rate_rad_s = np.array([0.01, -0.03, 0.02])
-    held = turning(rate_rad_s, tuple(np.arange(-1.2, 1.2, 0.002)))
-    assert len(held) == 1200
-    found, _ = held.rate_at(START_NS, 2.0, SIGMA_RAD)
-    np.testing.assert_allclose(found, rate_rad_s, atol=1e-9)
 
 
 def test_a_camera_that_speeds_up_has_the_rate_of_the_image() -> None:

@@ -171,18 +171,6 @@ def test_magnitude_limit_cuts(catalog):
         assert cut.digest == catalog.digest
 
 
-def test_select_takes_masks_numbers_and_slices(catalog):
-    few = catalog.select(slice(5))
-    assert np.array_equal(few.id, catalog.id[:5])
-    assert np.array_equal(few.select(np.array([3, 1])).id, catalog.id[[3, 1]])
-    mask = np.array([True, False, False, True, False])
-    picked = few.select(mask)
-    assert np.array_equal(picked.magnitude, few.magnitude[mask])
-    # Unit vectors belong to the selection, not to what it was taken from.
-    assert np.array_equal(picked.direction_icrs, few.direction_icrs[mask])
-    assert len(few.select(np.zeros(5, bool))) == 0
-
-
 @pytest.mark.parametrize('radius_deg', [0.0, 0.5, 13.0, 90.0, 179.99, 180.0])
 @pytest.mark.parametrize('limit', [None, 6.0])
 def test_cone_finds_what_brute_force_finds(catalog, radius_deg, limit):
@@ -212,9 +200,7 @@ def test_cone_finds_what_brute_force_finds(catalog, radius_deg, limit):
         (MotionSource.UNKNOWN_J2000, 13.0, 2026.0, 231.5),
     ],
 )
-def test_a_place_is_known_as_well_as_its_motion(
-    catalog, source: MotionSource, magnitude: float, jyear: float, mas: float
-) -> None:
+def test_a_place_is_known_as_well_as_its_motion(catalog, source, magnitude, jyear, mas) -> None:
     star = dataclasses.replace(
         catalog.select(slice(1)),
         motion_source=np.array([source], np.uint8),

@@ -24,7 +24,6 @@ from starcal_ros.stars.detection import (
 )
 from starcal_ros.stars.frame_checks import fingerprint, sample_rows, screen, ScreeningOptions
 from starcal_ros.stars.pixel_noise import NoiseSums
-from starcal_ros.stars.psf_fit import light_in_stamps
 
 SHAPE = (512, 640)
 WISPR = Path(__file__).parents[4] / 'shared' / 'realsky' / 'wispr_i_2022'
@@ -50,9 +49,7 @@ def test_a_black_sky_has_few_false_sources() -> None:
 
 @pytest.mark.parametrize('read_noise', [1.0, 3.0], ids=['under half a step', 'over a step'])
 @pytest.mark.parametrize('step_dn', [1, 16, 17, 257], ids='step of {}'.format)
-def test_values_that_step_are_measured_as_those_of_fewer_bits(
-    step_dn: int, read_noise: float
-) -> None:
+def test_values_that_step_are_measured_as_those_of_fewer_bits(step_dn, read_noise) -> None:
     """8 bits in the high ones of 12 (16) or scaled to 16 (257): the sigma is that of 8 bits."""
     xy = star_grid(3, 32)
     detector = dataclasses.replace(
@@ -178,63 +175,45 @@ def test_stars_beside_the_corona_are_measured() -> None:
         assert len(found.snr) > 300
 
 
-SIDE_PX, APART_PX, NOISE_DN, PSF_PX = 1024, 16, 4.0, 0.9
-MIN_SNR = 5.0
+NOISE_DN, PSF_PX, MIN_SNR = 4.0, 0.9, 5.0
 
 
-def places(rng: np.random.Generator) -> Floats:
-    """Pixels (3600, 2) of stars, each alone in its square."""
-    middles = np.arange(APART_PX * 2, SIDE_PX - APART_PX * 2, APART_PX)
-    grid = np.stack(np.meshgrid(middles, middles), axis=-1).reshape(-1, 2)
-    return np.asarray(rng.permutation(grid) + rng.uniform(-0.5, 0.5, grid.shape))
-
-
-def image_of(xy_px: Floats, flux_dn: Floats, rng: np.random.Generator) -> Pixels:
-    pixels = rng.normal(100.0, NOISE_DN, (SIDE_PX, SIDE_PX))
-    centre = np.rint(xy_px).astype(int)
-    stamps = light_in_stamps(xy_px - centre, flux_dn, np.full(len(xy_px), PSF_PX), 9)
-    for (u, v), light in zip(centre, stamps.reshape(-1, 9, 9), strict=True):
-        pixels[v - 4 : v + 5, u - 4 : u + 5] += light
-    shown: Pixels = np.rint(pixels.clip(0.0, 4095.0)).astype(np.uint16)
-    return shown
-
-
-def fluxes(brightest_snr: float, count: int) -> tuple[Floats, Floats]:
-    """Fluxes (n,) that fall by 7.5 mag, and their signal-to-noise ratios: sky noise alone."""
-    snr = brightest_snr * 10.0 ** (-3.0 * np.arange(count) / count)
-    return snr * NOISE_DN * np.sqrt(4.0 * np.pi * PSF_PX**2), snr
-
-
-@pytest.mark.parametrize('seed', [0, 1])
-def test_the_stars_left_out_are_far_below_the_noise(seed: int) -> None:
+def sky(seed: int, brightest_snr: float) -> tuple[Floats, Floats, Pixels]:
+    """Places (n, 2) of stars in squares of their own, ratios (n,) to the sky's noise, an image."""
     rng = np.random.default_rng(seed)
-    xy = places(rng)
-    flux, snr = fluxes(60.0, len(xy))
-    pixels = image_of(xy, flux, rng)
-    count = detectable_count(pixels, xy, measure_background(pixels), MIN_SNR)
+    xy = rng.permutation(star_grid(seed, 16, (1024, 1024)))[:3600]
+    snr = brightest_snr * 10.0 ** (-3.0 * np.arange(len(xy)) / len(xy))  # 7.5 mag
+    flux_dn = snr * NOISE_DN * np.sqrt(4.0 * np.pi * PSF_PX**2)
+    light = star_electrons(xy, flux_dn, PSF_PX, (1024, 1024))
+    shown = np.rint((light + rng.normal(100.0, NOISE_DN, light.shape)).clip(0.0, 4095.0))
+    return xy, snr, shown.astype(np.uint16)
+
+
+def kept(pixels: Pixels, xy: Floats) -> int:
+    return detectable_count(pixels, xy, measure_background(pixels), MIN_SNR)
+
+
+@pytest.mark.parametrize('seed', [0, 3])
+def test_the_stars_left_out_are_far_below_the_noise(seed: int) -> None:
+    xy, snr, pixels = sky(seed, 60.0)
+    count = kept(pixels, xy)
     assert count < len(xy)
     # Its 3 x 3 pixels have two thirds of the ratio of a fit: the first dark group has 0.4.
     assert snr[count] < 0.1 * MIN_SNR
 
 
 def test_stars_that_show_are_all_kept() -> None:
-    rng = np.random.default_rng(7)
-    xy = places(rng)
-    flux, _ = fluxes(2000.0, len(xy))  # the faintest at 2 sigma
-    pixels = image_of(xy, flux, rng)
-    assert detectable_count(pixels, xy, measure_background(pixels), MIN_SNR) == len(xy)
+    xy, _, pixels = sky(7, 2000.0)  # the faintest at 2 sigma
+    assert kept(pixels, xy) == len(xy)
 
 
 def test_a_saturated_neighbour_or_hot_pixel_darkens_no_group() -> None:
-    rng = np.random.default_rng(8)
-    xy = places(rng)
-    flux, snr = fluxes(60.0, len(xy))
-    pixels = image_of(xy, flux, rng)
-    whole = detectable_count(pixels, xy, measure_background(pixels), MIN_SNR)
+    xy, snr, pixels = sky(8, 60.0)
+    whole = kept(pixels, xy)
     # One in thirty windows has a lit pixel in its border.
     u, v = np.rint(xy[::30]).astype(int).T
     pixels[v + 3, u] = 4095
-    spoilt = detectable_count(pixels, xy, measure_background(pixels), MIN_SNR)
+    spoilt = kept(pixels, xy)
     # It takes 3 sigma from 8 of 256 stars, 0.1 of their mean, which falls by a quarter a group.
     assert abs(spoilt - whole) <= 2 * 256
     assert snr[spoilt] < 0.2 * MIN_SNR
@@ -243,5 +222,5 @@ def test_a_saturated_neighbour_or_hot_pixel_darkens_no_group() -> None:
 def test_few_stars_are_all_measured() -> None:
     pixels = np.full((64, 64), 100, np.uint16)
     xy = np.full((200, 2), 30.0)
-    assert detectable_count(pixels, xy, measure_background(pixels), MIN_SNR) == 200
-    assert detectable_count(pixels, xy[:0], measure_background(pixels), MIN_SNR) == 0
+    assert kept(pixels, xy) == 200
+    assert kept(pixels, xy[:0]) == 0

@@ -41,15 +41,13 @@ def exposed(
     )
 
 
-def field(
-    seed: int, detector: Detector, options: CentroidOptions = PSF
-) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
+def field(seed: int, detector: Detector) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
     """Errors (n, 2), centroids, bound variances (n, 2), snr (n,) of one image of unlike stars."""
     xy = star_grid(seed)
     # The same contrast for any width: the area of the PSF.
     area = (detector.psf_sigma_px / 0.95) ** 2
     flux = area * unlike_fluxes(seed, len(xy))
-    found = measured(exposed(seed, xy, flux, detector), xy, options)
+    found = measured(exposed(seed, xy, flux, detector), xy)
     bound, snr = centroid_bound(xy, flux, detector, SHAPE)
     return found.xy_px - xy, found, bound[:, [0, 1], [0, 1]], snr
 
@@ -233,9 +231,7 @@ def test_all_stars_above_eight_sigma_are_detected() -> None:
 
 
 @pytest.mark.parametrize(('threshold', 'images'), [(3.5, 2), (4.5, 6)])
-def test_noise_alone_gives_no_more_detections_than_it_should(
-    threshold: float, images: int
-) -> None:
+def test_noise_alone_gives_no_more_detections_than_it_should(threshold, images) -> None:
     # Local maxima of a Gaussian field above t sigma: (2 pi)^-3/2 L t exp(-t^2 / 2) per pixel with
     # L = 1 / (2 s^2) of the filter: 80 per image at 3.5 sigma, 2 at 4.5.
     density = (2 * np.pi) ** -1.5 * 0.5 * threshold * np.exp(-0.5 * threshold**2)
@@ -327,9 +323,7 @@ def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, f
         (np.uint16, 1, 3000, 4, 0.98 * 3000),
     ],
 )
-def test_the_saturation_level(
-    dtype: type, step_dn: int, peak: int, count: int, expected: float
-) -> None:
+def test_the_saturation_level(dtype, step_dn, peak, count, expected) -> None:
     pixels: np.ndarray = np.random.default_rng(8).integers(20, 60, SHAPE).astype(dtype) * step_dn
     pixels.flat[:count] = peak
     assert quantisation_step_dn(pixels) == step_dn
@@ -433,9 +427,7 @@ def test_a_star_with_lit_pixels_in_its_core_is_refused(lit: list[tuple[int, int,
     ('away', 'flux', 'lit'),
     [((2, 0), 3000.0, 2e4), ((-2, 1), 2e5, 3000.0), ((-1, -2), 3000.0, 2e4)],
 )
-def test_a_star_beside_a_single_lit_pixel_is_measured(
-    away: tuple[int, int], flux: float, lit: float
-) -> None:
+def test_a_star_beside_a_single_lit_pixel_is_measured(away, flux, lit) -> None:
     """Lit far above a faint star, and as bright as the flank of a bright one."""
     ray = np.zeros(SHAPE)
     ray[201 + away[1], 300 + away[0]] = lit
@@ -532,9 +524,7 @@ def test_the_fit_that_a_faint_star_is_spared_changes_nothing(
 @pytest.mark.parametrize(
     ('longest_px', 'flux_snr', 'min_snr'), [(0.0, 5.5, 5.0), (10.0, 6.5, 5.0), (10.0, 25.0, 20.0)]
 )
-def test_no_star_above_the_limit_is_surely_fainter(
-    longest_px: float, flux_snr: float, min_snr: float
-) -> None:
+def test_no_star_above_the_limit_is_surely_fainter(longest_px, flux_snr, min_snr) -> None:
     """Each star by its own path: in a roll the paths of one image differ."""
     count, noise_dn, noise = 2000, 5.0, PixelNoise(1.0, 0.0)
     rng = np.random.default_rng(1)

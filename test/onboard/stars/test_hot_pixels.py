@@ -119,9 +119,7 @@ def test_hot_pixels_of_a_dark_frame() -> None:
         ((0.0, 0.0), 2.0, StarRefusal.ELONGATED, StarRefusal.HOT_PIXEL),
     ],
 )
-def test_stars_on_hot_pixels(
-    offset: tuple[float, float], psf_px: float, before: StarRefusal, after: StarRefusal
-) -> None:
+def test_stars_on_hot_pixels(offset, psf_px, before, after) -> None:
     """Fitted in a window of four pixels about a star of one pixel, seven about one of two."""
     hot, star = np.array([50 * WIDTH + 70]), np.array([[70.0, 50.0]]) + offset
     refusal, radius_px = np.array([before], np.uint8), round(1.0 + 3.0 * psf_px)

@@ -24,9 +24,7 @@ PARTS = (np.arange(2000) + 0.5) / 2000 - 0.5
     ('sigma_px', 'length_px', 'angle_rad'),
     [(0.5, 10.0, 0.0), (0.5, 6.0, 0.5), (0.95, 2.0, 2.0), (0.95, 10.0, 0.5), (2.0, 10.0, 2.0)],
 )
-def test_light_of_a_streak_is_the_mean_of_its_places(
-    sigma_px: float, length_px: float, angle_rad: float
-) -> None:
+def test_light_of_a_streak_is_the_mean_of_its_places(sigma_px, length_px, angle_rad) -> None:
     path_px = length_px * np.array([math.cos(angle_rad), math.sin(angle_rad)])
     middle_px, width = np.array([0.2, -0.3]), 2 * stamp_radius_px(sigma_px, length_px) + 1
     many = len(PARTS)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 from rosbags.typesys import get_typestore, Stores
-from sample_records import observations, with_needed_fields, zeroed  # type: ignore[import-not-found]
+from sample_records import NEEDED, observations, with_needed_fields, zeroed  # type: ignore[import-not-found]
 
 from starcal_ground.bags import reader
 from starcal_ros.errors import BagError
@@ -28,8 +28,6 @@ from starcal_ros.formats.messages.record_messages import (
     checked_observations,
     observations_to_message,
 )
-from starcal_ros.record_fields import fields_of
-from starcal_ros.records import StarObservations
 
 END = '=' * 80
 HEAD = 'std_msgs/Header header\n'
@@ -79,10 +77,6 @@ def test_a_definition_that_differs_in_words_is_that_of_this_version(text: str) -
 
 
 FIELDS = [name for name, _ in store_with(OBSERVATIONS_TYPE).fielddefs[OBSERVATIONS_TYPE][1]]
-
-
-KINDS = fields_of(StarObservations).values()
-NEEDED = {kind.in_messages for kind in KINDS if not kind.has_default}
 
 
 @pytest.mark.parametrize('lacking', FIELDS[1:])

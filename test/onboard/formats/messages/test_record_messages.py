@@ -16,6 +16,7 @@ import pytest
 from sample_records import (  # type: ignore[import-not-found]
     assert_same,
     calibration,
+    NEEDED,
     observations,
     plain,
     plain_calibration,
@@ -46,14 +47,7 @@ from starcal_ros.formats.messages.record_messages import (
     observations_to_message,
     status_to_message,
 )
-from starcal_ros.record_fields import fields_of
-from starcal_ros.records import (
-    EnsembleStatus,
-    GateCheck,
-    refused_image,
-    StarObservations,
-    TemperatureTerms,
-)
+from starcal_ros.records import EnsembleStatus, GateCheck, refused_image, TemperatureTerms
 
 
 def test_calibration_round_trip() -> None:
@@ -179,11 +173,7 @@ def first(column: str, value: float) -> Any:
         ('temperature_degc', 1e300, r'temperature_degc: 1e\+300 is not within -273.15 to 1000'),
         ('velocity_sigma_m_s', -2.0, 'velocity_sigma_m_s: -2.0 is not at least 0'),
         ('velocity_sigma_m_s', np.inf, 'velocity_sigma_m_s: inf is not a finite number'),
-        (
-            'star_tracker_rate_rad_s',
-            np.array([0, 0, np.inf]),
-            r'star_tracker_rate_rad_s\[2\]: inf',
-        ),
+        ('star_tracker_rate_rad_s', np.r_[0, 0, np.inf], r'star_tracker_rate_rad_s\[2\]: inf'),
         ('attitude_gap_s', -1.0, 'attitude_gap_s: -1.0 is not at least 0'),
         ('background_dn', np.inf, 'background_dn: inf is not a finite number'),
         ('width', 2**32 - 1, 'width: 4294967295 is not within 0 to 65536'),
@@ -248,13 +238,6 @@ def test_refused_stars_are_found_by_reason() -> None:
     np.testing.assert_array_equal(places['saturated'], record.refused_px[[1]])
 
 
-NEEDED = {
-    kind.in_messages.split('.')[0]
-    for kind in fields_of(StarObservations).values()
-    if not kind.has_default
-}
-
-
 def test_a_message_with_everything_but_the_stars_at_zero_says_nothing_else() -> None:
     """A velocity was exact, a camera did not turn, and the zenith refused the image."""
     sent = observations()
@@ -282,9 +265,7 @@ def test_an_exact_velocity_is_not_sent_as_zero(sigma_m_s: float, sent: float) ->
     ('rate', 'sigma', 'is_known'),
     [(0.0, 0.0, False), (0.0, np.nan, False), (0.0, 1e-5, True), (1e-3, 0.0, True)],
 )
-def test_a_camera_at_rest_has_a_rate_with_a_sigma(
-    rate: float, sigma: float, is_known: bool
-) -> None:
+def test_a_camera_at_rest_has_a_rate_with_a_sigma(rate, sigma, is_known) -> None:
     message = observations_to_message(observations(), 'cam', plain)
     message.star_tracker_rate_rad_s = np.full(3, rate)
     message.star_tracker_rate_sigma_rad_s = np.full(3, sigma)

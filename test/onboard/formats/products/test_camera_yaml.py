@@ -293,18 +293,10 @@ BAD = {
         ('-0.1, 1e-2', '1e300, 1e300', 'no line of sight over most of the detector'),
         ('-0.1, 1e-2', '-50.0, 0.0', 'no line of sight over most of the detector'),
         ('image_width: 640', 'image_width: 99999999', 'image size: 99999999 x 480 is over'),
-        (
-            'image_width: 640',
-            'image_width: 640\nimage_width: 1',
-            "line 2: duplicate key 'image_width'",
-        ),
+        ('image_width: 640', 'image_width: 640\nimage_width: 1', 'line 2: duplicate key'),
         ('[500.0, 0.5', '[.nan, 0.5', r'camera_matrix.data\[0\]: nan is not a finite number'),
         ('239.5, 0, 0, 1]', '239.5, 0, 0, 2]', 'camera_matrix.data: .* is not'),
-        (
-            '[-0.1, 1e-2, 1e-05, -2.0e-4, 0.003]',
-            '[-0.1]',
-            '1 coefficients of plumb_bob, which has 5',
-        ),
+        (', 1e-2, 1e-05, -2.0e-4, 0.003', '', '1 coefficients of plumb_bob, which has 5'),
         ('camera_matrix', 'matrix', "key 'camera_matrix' is missing"),
         ('image_width: 640', 'image_width: [', 'not YAML'),
         (ROS_YAML, '', 'not'),
@@ -336,9 +328,7 @@ BAD = {
     [(text, *row) for text, rows in BAD.items() for row in rows],
     ids=itertools.count(),
 )
-def test_a_bad_camera_file_is_refused_by_file_and_key(
-    tmp_path: Path, text: str, old: str, new: str, words: str
-) -> None:
+def test_a_bad_camera_file_is_refused_by_file_and_key(tmp_path, text, old, new, words) -> None:
     path = tmp_path / 'camera.yaml'
     assert old in text
     path.write_text(text.replace(old, new))
