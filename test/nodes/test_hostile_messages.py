@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 import contextlib
 import itertools
-from pathlib import Path
 import random
 import subprocess
 import sys
@@ -140,7 +139,7 @@ def compressed_image() -> Any:
 @pytest.mark.parametrize(
     ('kind', 'template'), [(Image, small_image), (CompressedImage, compressed_image)]
 )
-def test_every_image_is_answered(vehicle: Vehicle, kind: Any, template: Callable[[], Any]) -> None:
+def test_every_image_is_answered(vehicle, kind, template) -> None:
     node = vehicle.start('star_observer', 'attitude_timeout_s:=0.0', ros=REMAPS)
     answers = vehicle.collect(StarObservations, 'observations')
     infos = vehicle.collect(CameraInfo, 'image_camera_info')
@@ -160,7 +159,7 @@ def test_every_image_is_answered(vehicle: Vehicle, kind: Any, template: Callable
     assert node.process.poll() is None
 
 
-def test_the_star_observer_measures_images_after_hostile_messages(vehicle: Vehicle) -> None:
+def test_the_star_observer_measures_images_after_hostile_messages(vehicle) -> None:
     node = vehicle.start('star_observer', ros=REMAPS)
     answers = vehicle.collect(StarObservations, 'observations')
     received = Received(vehicle, 'star_observer')
@@ -185,9 +184,7 @@ def test_the_star_observer_measures_images_after_hostile_messages(vehicle: Vehic
     assert node.process.poll() is None
 
 
-def test_the_calibrator_calibrates_after_hostile_messages(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_the_calibrator_calibrates_after_hostile_messages(vehicle, tmp_path) -> None:
     """Those that pass for observations are saved as well."""
     state = f'state_dir:={tmp_path}/state'
     node = vehicle.start('calibrator', 'max_images:=30', state)
@@ -225,7 +222,7 @@ def filled(vehicle: Vehicle) -> NodeProcess:
     return node
 
 
-def test_callers_at_once_and_callers_that_end(client: Client, filled: NodeProcess) -> None:
+def test_callers_at_once_and_callers_that_end(client, filled) -> None:
     callers = [client.node.create_client(Trigger, '/calibrator/calibrate') for _ in range(10)]
     client.until(lambda: all(caller.service_is_ready() for caller in callers))
     futures = [caller.call_async(Trigger.Request()) for caller in callers]
@@ -254,15 +251,13 @@ time.sleep(60)
 """
 
 
-def test_a_second_calibrator_is_warned_of(vehicle: Vehicle, filled: NodeProcess) -> None:
+def test_a_second_calibrator_is_warned_of(vehicle, filled) -> None:
     vehicle.start('calibrator', ros=('-r', '__node:=double'))
     vehicle.until(lambda: 'another node publishes' in vehicle.health('calibrator')[1])
     vehicle.calibrate()
 
 
-def test_calls_to_a_node_that_is_deactivated_are_answered(
-    client: Client, filled: NodeProcess
-) -> None:
+def test_calls_to_a_node_that_is_deactivated_are_answered(client, filled) -> None:
     calls = [(client.node.create_client(Calibrate, '/calibrator/solve'), Calibrate.Request())]
     for name in ('calibrate', 'rollback'):
         service = client.node.create_client(Trigger, f'/calibrator/{name}')
@@ -277,7 +272,7 @@ def test_calls_to_a_node_that_is_deactivated_are_answered(
     assert filled.process.poll() is None
 
 
-def test_kill_9_loses_no_image_that_was_saved(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_kill_9_loses_no_image_that_was_saved(vehicle, tmp_path) -> None:
     """Kills at random during images and solves, and of nodes that start."""
     choose = random.Random(2)
     with contextlib.closing(Flight(vehicle, tmp_path)) as flight:

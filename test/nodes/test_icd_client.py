@@ -20,7 +20,7 @@ import pytest
 from rosbags import highlevel as rosbags
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
-from vehicle import BOTH, Vehicle  # type: ignore[import-not-found]
+from vehicle import BOTH  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
@@ -52,7 +52,7 @@ def bag_messages(folder: Path) -> Iterator[Any]:
             yield made
 
 
-def test_calibrates_through_the_icd(vehicle: Vehicle) -> None:
+def test_calibrates_through_the_icd(vehicle) -> None:
     """Images and attitudes give the true camera, also to late subscribers."""
     for name in BOTH:
         vehicle.start(name)

@@ -131,7 +131,7 @@ def learned(delay_ms: int, period_ms: int = 200) -> StarTrackers:
 
 
 @pytest.mark.parametrize(('delay_ms', 'period_ms'), [(0, 200), (1000, 200), (0, 1000)])
-def test_a_slow_or_delayed_one_is_waited_for(delay_ms: int, period_ms: int) -> None:
+def test_a_slow_or_delayed_one_is_waited_for(delay_ms, period_ms) -> None:
     trackers = learned(delay_ms, period_ms)
     send(trackers, 0, *range(5100, 5201, 100))
     assert not trackers.has_come(5150 * MS)
@@ -160,7 +160,7 @@ def test_one_that_falls_silent_is_waited_for_twice_its_delay() -> None:
     ],
 )
 def test_a_star_tracker_is_awaited_until_it_has_sent_something_after_a_time(
-    first_ms: list[int], other_ms: list[int], expected: set[int]
+    first_ms, other_ms, expected
 ) -> None:
     trackers = star_trackers(2)
     send(trackers, 0, *first_ms)
@@ -169,7 +169,7 @@ def test_a_star_tracker_is_awaited_until_it_has_sent_something_after_a_time(
 
 
 @pytest.mark.parametrize('stamps_ms', [[], [-(10**9), -(10**9) + 100]])
-def test_one_that_sends_nothing_or_by_another_clock_is_not(stamps_ms: list[int]) -> None:
+def test_one_that_sends_nothing_or_by_another_clock_is_not(stamps_ms) -> None:
     trackers = star_trackers(2)
     send(trackers, 1, *stamps_ms)
     send(trackers, 0, *range(0, 1301, 100))
@@ -214,9 +214,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return clock
 
 
-def test_an_image_waits_for_the_samples_of_its_rate_while_they_come(
-    clock: Clock,
-) -> None:
+def test_an_image_waits_for_the_samples_of_its_rate_while_they_come(clock) -> None:
     one = star_trackers(1)
     send(one, 0, *range(0, 2001, 100))
     assert one.has_come(1050 * MS)  # the next one, due at 2100 ms, is more than a second later
@@ -225,7 +223,7 @@ def test_an_image_waits_for_the_samples_of_its_rate_while_they_come(
     assert one.has_come(1150 * MS)
 
 
-def test_rate_is_right_from_the_start(clock: Clock) -> None:
+def test_rate_is_right_from_the_start(clock) -> None:
     """Before the window is full the rate is over the time since the start."""
     recent = Recent()
     assert (recent.rate_hz(), recent.median(), recent.largest()) == (0.0, None, None)
@@ -236,7 +234,7 @@ def test_rate_is_right_from_the_start(clock: Clock) -> None:
     assert (recent.median(), recent.largest()) == (19.5, 39.0)
 
 
-def test_what_is_old_is_forgotten(clock: Clock) -> None:
+def test_what_is_old_is_forgotten(clock) -> None:
     recent = Recent()
     recent.add(1000.0)
     for k in range(1, 301):
@@ -261,9 +259,7 @@ def test_what_is_old_is_forgotten(clock: Clock) -> None:
         ([*[0.1] * 600, 60.0] * 2 + [0.1] * 600, 100.0, ''),  # telemetry once a minute
     ],
 )
-def test_a_stream_has_ended_by_its_own_interval(
-    clock: Clock, steps_s: list[float], silent_s: float, words: str
-) -> None:
+def test_a_stream_has_ended_by_its_own_interval(clock, steps_s, silent_s, words) -> None:
     arrivals = Arrivals()
     assert not arrivals and not arrivals.ended(5.0)
     arrivals.add()

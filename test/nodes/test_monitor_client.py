@@ -9,7 +9,6 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 import pytest
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from sample_records import calibration, observations, status  # type: ignore[import-not-found]
-from vehicle import Client, StartNode  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal_ground.ros.monitor_client import Monitor
@@ -25,7 +24,7 @@ pytestmark = pytest.mark.nodes
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
-def test_what_the_nodes_publish_is_seen(client: Client) -> None:
+def test_what_the_nodes_publish_is_seen(client) -> None:
     monitor = Monitor(client._context)
     client._executor.add_node(monitor)
 
@@ -68,9 +67,7 @@ def test_what_the_nodes_publish_is_seen(client: Client) -> None:
         monitor.destroy_node()
 
 
-def test_a_signal_while_it_draws_ends_it_without_a_traceback(
-    client: Client, start_node: StartNode
-) -> None:
+def test_a_signal_while_it_draws_ends_it_without_a_traceback(client, start_node) -> None:
     """Signals at other times: test_node_lifecycle.py, for all that end by `until_told_to_end`."""
     monitor = start_node('starcal_ground.ros.monitor_client', '-r', '__node:=ended', forked=False)
     client.until(lambda: 'ended' in client.node.get_node_names())
@@ -81,9 +78,7 @@ def test_a_signal_while_it_draws_ends_it_without_a_traceback(
     ('client_name', 'remap'),
     [('monitor_client', '__ns:=bad name'), ('calibrate_client', ':=')],
 )
-def test_a_bad_remap_is_answered_without_a_traceback(
-    start_node: StartNode, client_name: str, remap: str
-) -> None:
+def test_a_bad_remap_is_answered_without_a_traceback(start_node, client_name, remap) -> None:
     """The last line is ours, after those that rcl logs; one ends with its own interpreter."""
     module, is_forked = f'starcal_ground.ros.{client_name}', remap != ':='
     process = start_node(module, '-r', remap, forked=is_forked)

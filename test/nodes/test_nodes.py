@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import functools
 import importlib.util
@@ -22,17 +21,7 @@ from rcl_interfaces.srv import DescribeParameters, SetParameters
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, Imu, Temperature
 from std_srvs.srv import Trigger
-from vehicle import (  # type: ignore[import-not-found]
-    ATTITUDES,
-    BOTH,
-    Client,
-    IMAGES,
-    parameters,
-    REMAPS,
-    StartNode,
-    tiny_observations,
-    Vehicle,
-)
+from vehicle import ATTITUDES, BOTH, Client, IMAGES, parameters, REMAPS, tiny_observations  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
 from starcal.srv import Calibrate, LineOfSightTable
@@ -79,7 +68,7 @@ def attitude(stamp_ns: int) -> Any:
     return attitude_to_message(stamp_ns, np.array([0, 0, 0, 1.0]), '', make_message)
 
 
-def test_nodes_and_tool_give_the_same_calibration(vehicle: Vehicle, tiny_products: Path) -> None:
+def test_nodes_and_tool_give_the_same_calibration(vehicle, tiny_products) -> None:
     """The observations have rates and the sigma of the velocity, the picture the image's size."""
     for name in BOTH:
         vehicle.start(name, ros=REMAPS)
@@ -122,7 +111,7 @@ def test_nodes_and_tool_give_the_same_calibration(vehicle: Vehicle, tiny_product
 
 
 def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool(
-    vehicle: Vehicle, tmp_path: Path
+    vehicle, tmp_path
 ) -> None:
     """The observer measures the images that matched no star again with the first calibration."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
@@ -147,7 +136,7 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
     np.testing.assert_allclose(live.sigma, offline.sigma, rtol=1e-4)
 
 
-def test_each_service_of_a_calibrator(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_each_service_of_a_calibrator(vehicle, tmp_path) -> None:
     """Dry runs, bad requests, a table, roll-back, reset: one calibration is ever published."""
     vehicle.start('calibrator')
     # A call that changes nothing: if its answer is lost, it is called again.
@@ -204,7 +193,7 @@ def test_each_service_of_a_calibrator(vehicle: Vehicle, tmp_path: Path) -> None:
     assert not none.success and 'no calibration before' in none.message
 
 
-def test_gate_refusal_and_force(vehicle: Vehicle) -> None:
+def test_gate_refusal_and_force(vehicle) -> None:
     """A refused candidate is only in the response, unless it is forced."""
     calibrator = vehicle.start_filled('max_change_px:=1e-6')
     found = vehicle.until_latched(Calibration, 'calibration')
@@ -226,7 +215,7 @@ def test_gate_refusal_and_force(vehicle: Vehicle) -> None:
     assert calibrator.process.poll() is None
 
 
-def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle: Vehicle) -> None:
+def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle) -> None:
     """The attitudes are those of an Imu, which the node takes by the type of their publisher."""
     ros = (*REMAPS, '-r', 'temperature:=/box')
     vehicle.start('star_observer', 'attitude_timeout_s:=60.0', ros=ros)
@@ -256,7 +245,7 @@ def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle: Vehicl
     assert answers[0].temperature_degc == -7.25
 
 
-def test_overrun_is_answered(vehicle: Vehicle) -> None:
+def test_overrun_is_answered(vehicle) -> None:
     """With more images than the queue holds, each is answered, the surplus with overrun."""
     vehicle.start('star_observer', 'attitude_timeout_s:=60.0')
     answers: list[Any] = vehicle.collect(StarObservations, 'observations')
@@ -273,7 +262,7 @@ def test_overrun_is_answered(vehicle: Vehicle) -> None:
     assert [a.refusal for a in answers] == ['wrong_size'] * 20 + ['overrun'] * 20
 
 
-def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
+def test_camera_info_per_image(vehicle, tiny_products) -> None:
     """The active calibration with the header of each image; never the prior or a candidate."""
     active = read_calibration(tiny_products / CALIBRATION_FILE)
     candidate = dataclasses.replace(active, accepted=False, reasons=('bad',))
@@ -322,7 +311,7 @@ def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
     assert lossy[0].k[0] > 0
 
 
-def test_calibrator_collects_while_it_solves(vehicle: Vehicle) -> None:
+def test_calibrator_collects_while_it_solves(vehicle) -> None:
     """Observations that arrive during a calibration are all counted, bad ones are logged."""
     calibrator = vehicle.start_filled()
     observations = vehicle.publisher(StarObservations, 'observations')
@@ -376,14 +365,7 @@ OBSERVER, CALIBRATOR = BOTH
         ),
     ],
 )
-def test_bad_parameters(
-    start_node: StartNode,
-    tiny_bag: Path,
-    tmp_path: Path,
-    name: str,
-    arguments: Callable[[Path, Path], tuple[str, ...]],
-    text: str,
-) -> None:
+def test_bad_parameters(start_node, tiny_bag, tmp_path, name, arguments, text) -> None:
     """A bad parameter ends a node with status 2 and one line that names it."""
     node = start_node(name, *arguments(tiny_bag, tmp_path))
     assert node.wait() == 2
@@ -391,7 +373,7 @@ def test_bad_parameters(
     assert text in line and 'Traceback' not in node.said()
 
 
-def test_parameters_while_running(vehicle: Vehicle) -> None:
+def test_parameters_while_running(vehicle) -> None:
     """Parameters have descriptions, and those in use cannot be changed."""
     node = vehicle.start('star_observer', 'max_attitude_gap_s:=3')
     described = vehicle.call(
@@ -429,7 +411,7 @@ def set_gap(
     return '' if answer.results[0].successful else str(answer.results[0].reason)
 
 
-def test_player_loses_nothing(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_player_loses_nothing(vehicle, tmp_path) -> None:
     """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
     with BagWriter(tmp_path / 'large') as writer:
@@ -457,7 +439,7 @@ def test_player_loses_nothing(vehicle: Vehicle, tmp_path: Path) -> None:
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_bag_plays_again_by_its_clock(vehicle: Vehicle) -> None:
+def test_a_bag_plays_again_by_its_clock(vehicle) -> None:
     """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
     for name in BOTH:
         ros = ('-r', '__ns:=/cam', '-r', f'__node:={name}', *REMAPS, '--log-level', 'info')
@@ -490,7 +472,7 @@ def warns_of_clock(message: DiagnosticArray) -> bool:
     return bool(status.level == b'\x01' and status.message.startswith('no /clock: '))
 
 
-def test_the_policies_name_what_the_nodes_have(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_the_policies_name_what_the_nodes_have(vehicle, tmp_path) -> None:
     """Each security policy allows exactly the topics and services of its node."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_image('/image', ImageRecord(1, np.zeros((2, 2), np.uint8)), 'camera')

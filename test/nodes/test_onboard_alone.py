@@ -17,7 +17,7 @@ import sys
 from ament_index_python.packages import get_packages_with_prefixes
 from packaging.requirements import Requirement
 import pytest
-from vehicle import BOTH, REMAPS, Vehicle  # type: ignore[import-not-found]
+from vehicle import BOTH, REMAPS  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration
 import starcal_ros
@@ -101,7 +101,7 @@ def test_what_stays_on_the_ground_cannot_be_imported() -> None:
 
 
 def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
-    vehicle: Vehicle, few_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    vehicle, few_images, tmp_path, monkeypatch
 ) -> None:
     """Of the messages of a player on the ground, with a state folder."""
     vehicle.bag = few_images
