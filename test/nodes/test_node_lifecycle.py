@@ -6,8 +6,6 @@ from __future__ import annotations
 import ctypes
 import random
 import signal
-import subprocess
-import sys
 import threading
 import time
 from typing import Any
@@ -16,6 +14,7 @@ from lifecycle_msgs.msg import Transition
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager, NO_TRANSITION  # type: ignore[import-not-found]
 import pytest
 import rclpy
+from starcal_tool import run_python  # type: ignore[import-not-found]
 from std_msgs.msg import Empty
 from vehicle import BOTH, parameters  # type: ignore[import-not-found]
 
@@ -82,8 +81,7 @@ def test_every_transition_in_every_state(vehicle, state, shut_down) -> None:
 
 def run(code: str, *arguments: str) -> tuple[int, str, str]:
     """Exit status and output of a process that runs some lines."""
-    command = [sys.executable, '-c', code, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_python('-c', code, *arguments)
     return done.returncode, done.stdout, done.stderr
 
 

@@ -17,11 +17,11 @@ import json
 from pathlib import Path
 import re
 import shutil
-import subprocess
 from typing import Any
 
 import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from starcal_tool import run  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.player_options import PlayerOptions
@@ -343,10 +343,7 @@ def made_by(name: str, folder: Path, *events: dict[str, Any]) -> Any:
     """Return what a script makes of the last of some events."""
     (folder / 'script.mjs').write_text(without_types(SCRIPTS[name]))
     (folder / 'run.mjs').write_text(_RUN)
-    done = subprocess.run(
-        [NODE, 'run.mjs', json.dumps(events)],
-        cwd=folder, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run(NODE, 'run.mjs', json.dumps(events), cwd=folder)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 

@@ -10,14 +10,13 @@ from pathlib import Path
 import re
 import shlex
 import shutil
-import subprocess
-import sys
 from xml.etree import ElementTree
 
 import cv2
 import numpy as np
 from PIL import Image
 import pytest
+from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 from starcal_ground.bags.player_options import PlayerOptions
 from starcal_ground.cli import main
@@ -33,13 +32,6 @@ from starcal_ros.pipeline.setup import load_setup, NODE_OPTION_CLASSES, OPTION_C
 ROOT = Path(__file__).resolve().parents[2]
 DOCUMENTS = sorted([*ROOT.glob('*.md'), *(ROOT / 'docs').glob('*.md'), *ROOT.glob('bags/*/*.md')])
 OPTIONS = (*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
-RUN_S = 240.0
-
-
-def run(*command: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [*map(str, command)], cwd=ROOT, capture_output=True, text=True, timeout=RUN_S
-    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -162,7 +154,7 @@ def test_pictures_show_something() -> None:
 
 
 def test_tables_are_as_the_code_has_them() -> None:
-    checked = run(sys.executable, '-m', 'docs.make_tables', '--check')
+    checked = run_python('-m', 'docs.make_tables', '--check', cwd=ROOT)
     assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
@@ -320,7 +312,7 @@ def test_the_readme_is_one_page() -> None:
 
 @pytest.mark.parametrize('target', MAKE_TARGETS)
 def test_make_knows_the_target(target) -> None:
-    assert run('make', '--dry-run', target).returncode == 0
+    assert run('make', '--dry-run', target, cwd=ROOT).returncode == 0
 
 
 def interface(directions: str) -> dict[str, str]:

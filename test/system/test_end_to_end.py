@@ -16,6 +16,7 @@ from mission_files import params_with  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import run_python  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.frames import read_telemetry
@@ -171,9 +172,8 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
     whole = (TINY / 'tiny_0.mcap').read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) * 7 // 10])
-    tool = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate', bag, '--no-report']
-    given = ['--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
-    done = subprocess.run([*tool, *given], capture_output=True, text=True, check=False)
+    given = ['calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
+    done = run_python('-m', 'starcal_ground.cli.main', *given, '--no-report')
     assert done.returncode == 0, done.stderr
     damage, refused = done.stderr.splitlines()
     assert 'truncated' in damage and '1 of 7 images refused, no_attitude' in refused

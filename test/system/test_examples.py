@@ -12,11 +12,11 @@ import doctest
 import json
 from pathlib import Path
 import shutil
-import subprocess
 import sys
 import typing
 
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 import starcal_ground
 from starcal_ground.comparison import Comparison
@@ -28,15 +28,9 @@ EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 TINY = EXAMPLES.parent / 'bags' / 'tiny'
 
 
-def run(cwd: Path, *command: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *map(str, command)], cwd=cwd, capture_output=True, text=True
-    )
-
-
 @pytest.mark.slow
 def test_from_arrays(tmp_path) -> None:
-    done = run(tmp_path, EXAMPLES / 'from_arrays.py')
+    done = run_python(EXAMPLES / 'from_arrays.py', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     verdict, *rows, sight = done.stdout.splitlines()
     assert verdict == 'accepted' and len(rows) == 10
@@ -51,14 +45,16 @@ def test_from_arrays(tmp_path) -> None:
 def test_from_bag(few_images, tmp_path) -> None:
     written = tmp_path / 'calibration.json'
     params = few_images / 'params.yaml'
-    done = run(tmp_path, EXAMPLES / 'from_bag.py', few_images, params, written)
+    done = run_python(EXAMPLES / 'from_bag.py', few_images, params, written, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert len(done.stdout.splitlines()) == 10
     assert read_calibration(written).accepted
 
 
 def test_from_a_bag_that_is_not_there(tmp_path) -> None:
-    done = run(tmp_path, EXAMPLES / 'from_bag.py', 'none', TINY / 'params.yaml', 'out.json')
+    done = run_python(
+        EXAMPLES / 'from_bag.py', 'none', TINY / 'params.yaml', 'out.json', cwd=tmp_path
+    )
     assert (done.returncode, done.stdout) == (2, '')
     assert done.stderr == 'none: no such file or folder\n'
 
@@ -86,7 +82,9 @@ def test_the_notebook_is_kept_without_outputs() -> None:
 def test_mission(few_images, tmp_path) -> None:
     """FITS and AEM to kernels that spiceypy loads, with the boresight of the calibration."""
     params = few_images / 'params.yaml'
-    done = run(tmp_path, EXAMPLES / 'mission.py', few_images, params, tmp_path / 'mission')
+    done = run_python(
+        EXAMPLES / 'mission.py', few_images, params, tmp_path / 'mission', cwd=tmp_path
+    )
     assert (done.returncode, done.stderr) == (0, '')
     difference = done.stdout.splitlines()[-1].removeprefix('difference from the calibration: ')
     assert float(difference.split()[0]) < 1e-9
@@ -95,7 +93,7 @@ def test_mission(few_images, tmp_path) -> None:
 
 @pytest.mark.parametrize('name', ['from_bag.py', 'mission.py'])
 def test_without_arguments_the_usage_is_printed(name, tmp_path) -> None:
-    done = run(tmp_path, EXAMPLES / name)
+    done = run_python(EXAMPLES / name, cwd=tmp_path)
     assert done.returncode == 2
     assert done.stderr.startswith(f'usage: python {name} BAG PARAMS ')
     assert done.stderr.count('\n') == 1

@@ -11,10 +11,9 @@ import ast
 from collections.abc import Iterator
 import graphlib
 from pathlib import Path
-import subprocess
-import sys
 
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 import starcal_ros
 
@@ -141,6 +140,6 @@ COMMANDS = 'starcal_ground.cli.commands'
 )
 def test_a_start_does_not_wait_for_what_it_seldom_needs(start, needs, does_not_wait_for) -> None:
     show = f'{start}\nimport sys; print(*sys.modules, file=sys.stderr)'
-    done = subprocess.run([sys.executable, '-c', show], capture_output=True, text=True, check=True)
+    done = run_python('-c', show, check=True)
     loaded = set(done.stderr.split())
     assert {*needs.split()} <= loaded and not {*does_not_wait_for.split()} & loaded

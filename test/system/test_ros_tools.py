@@ -16,6 +16,7 @@ from typing import Any
 
 from mission_files import params_with  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -337,15 +338,9 @@ def test_without_the_wheels_rosbag2_reads_bags(
     write(tmp_path / 'bag')
     (tmp_path / 'sitecustomize.py').write_text(HIDDEN)
     path = f'{tmp_path}:{ROOT}:{ros2.environment["PYTHONPATH"]}'
-    words = ('calibrate', 'bag', '--params', str(TINY / 'params.yaml'), '-o', 'out')
-    done = subprocess.run(
-        [sys.executable, '-m', 'starcal_ground.cli.main', *words],
-        env=ros2.environment | {'PYTHONPATH': path},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ('calibrate', 'bag', '--params', TINY / 'params.yaml', '-o', 'out')
+    env = ros2.environment | {'PYTHONPATH': path}
+    done = run_python('-m', 'starcal_ground.cli.main', *words, env=env, cwd=tmp_path)
     install = f'{sys.executable} -m pip install mcap rosbags'
     if line:
         assert done.returncode == 2 and line.format(install=install) in done.stderr

@@ -19,6 +19,7 @@ import sys
 
 from attacks import BAG, digests, many, NO_FILES  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import run  # type: ignore[import-not-found]
 
 from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
@@ -241,8 +242,7 @@ def test_what_starcal_did_not_write_is_not_replaced(command, campaign, tmp_path,
 def test_standard_streams_that_are_closed_full_or_abandoned(line, campaign) -> None:
     """Those of a result, and those of an error."""
     words = line.replace('OUT', str(campaign / 'out'))
-    command = f'{sys.executable} -m starcal_ground.cli.main {words}'
-    done = subprocess.run(['bash', '-c', command], capture_output=True, text=True)
+    done = run('bash', '-c', f'{sys.executable} -m starcal_ground.cli.main {words}')
     assert 'Traceback' not in done.stdout + done.stderr
     assert 'Exception' not in done.stdout + done.stderr
 

@@ -18,7 +18,7 @@ import sys
 from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from starcal_tool import assert_refused  # type: ignore[import-not-found]
+from starcal_tool import assert_refused, run_python  # type: ignore[import-not-found]
 
 from starcal_ground.child_process import module_command
 from starcal_ground.cli import main, node_processes
@@ -230,7 +230,7 @@ diagnose.run = interrupted
 sys.argv = ['starcal', 'diagnose', 'x']
 sys.exit(entry_point.main())
 """
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    done = run_python('-c', code)
     assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, 'starcal: interrupted\n')
 
 
@@ -245,7 +245,7 @@ become = os.execv
 os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
 node_processes.become('bag_player', node_processes.player_arguments(Path('none'), 1.0), [])
 """
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
+    done = run_python('-c', code)
     assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
 
 
