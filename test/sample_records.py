@@ -267,7 +267,6 @@ def attitude_message(kind: str, time_ns: int, xyzw: Any) -> Any:
 
 
 def plain(_type: str, /, **fields: Any) -> SimpleNamespace:
-    """Return a plain object with the fields of a message."""
     return SimpleNamespace(**fields)
 
 
