@@ -113,13 +113,10 @@ def test_of_several_types_on_a_topic_one_is_played(vehicle, tmp_path) -> None:
     """The bytes of the others went out as messages of it; a name of another tool ended it."""
     with BagWriter(tmp_path / 'mixed.mcap') as writer:
         for k, topic in enumerate(('/mixed', '/mixed', '/mixed', '/of another tool')):
-            kind = 'std_msgs/msg/String' if k != 1 else TEMPERATURE_TYPE
-            header = make_header(k, '', make_message)
-            fields = (
-                {'data': str(k)}
-                if k != 1
-                else {'header': header, 'temperature': 0.0, 'variance': 0.0}
-            )
+            kind, fields = 'std_msgs/msg/String', dict[str, Any](data=str(k))
+            if k == 1:
+                kind, header = TEMPERATURE_TYPE, make_header(k, '', make_message)
+                fields = {'header': header, 'temperature': 0.0, 'variance': 0.0}
             writer._channels.pop(topic, None)
             writer.write(topic, kind, k, make_message(kind, **fields))
     found: list[Any] = vehicle.collect(String, '/mixed')
@@ -156,9 +153,8 @@ def test_messages_of_another_version_are_played_as_those_of_this_one(vehicle, tm
     assert other == []
     for one in found:
         assert_same(observations_from_message(one), replace(observations(), detail=''))
-    assert (
-        player.said().count('/other: starcal/msg/StarObservations is defined in the bag as') == 1
-    )
+    words = '/other: starcal/msg/StarObservations is defined in the bag as'
+    assert player.said().count(words) == 1
 
 
 def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:

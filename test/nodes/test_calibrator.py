@@ -40,7 +40,6 @@ from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     camera_info_to_message,
 )
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
@@ -166,7 +165,6 @@ rclpy.spin(node)
 
 @contextmanager
 def driver(kept: Path) -> Iterator[None]:
-    """A camera driver in a process of its own."""
     process = subprocess.Popen([sys.executable, '-c', DRIVER, str(kept), SERVICE])
     try:
         yield
@@ -176,7 +174,6 @@ def driver(kept: Path) -> Iterator[None]:
 
 
 def until_told(client: Client, outcome: str, level: bytes) -> None:
-    """Wait for the level and the outcome of the driver in the diagnostics."""
 
     def is_so() -> bool:
         newest, _, values = client.health('calibrator')
@@ -220,12 +217,8 @@ def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
     vehicle.calibrate()
     vehicle.until(lambda: len(received) > before)
     said = calibrator.said()
-    for outcome in (
-        'service not available',
-        'no answer within 5 s',
-        'refused: sensor busy',
-        'accepted',
-    ):
+    failures = ('service not available', 'no answer within 5 s', 'refused: sensor busy')
+    for outcome in (*failures, 'accepted'):
         assert f'{SERVICE}: {outcome}' in said
     assert 'Traceback' not in said
 
@@ -248,22 +241,18 @@ def test_a_driver_process_that_restarts(vehicle, tmp_path) -> None:
 
 
 # How the heir of a calibrator differs, and why it has no active calibration.
+STRICT = ('max_change_px:=1e-6',)
 HEIRS = {
-    'stricter limits': (
-        ('max_change_px:=1e-6',),
-        'state',
-        'calibration 1 is not active, the gate',
-    ),
+    'stricter limits': (STRICT, 'state', 'calibration 1 is not active, the gate'),
     'an empty folder': ((), 'empty', ''),
 }
 
 
 @pytest.mark.parametrize('name', HEIRS)
-def test_consumers_return_to_the_prior(vehicle, name, tiny_products, tmp_path) -> None:
+def test_consumers_return_to_the_prior(vehicle, name, tiny, tmp_path) -> None:
     """The star observer, the camera of each image, and the monitor; and back to a calibration."""
     values, folder, why = HEIRS[name]
-    stored = read_calibration(tiny_products / CALIBRATION_FILE)
-    stored = dataclasses.replace(stored, number=1, active_since_ns=1)
+    stored = dataclasses.replace(tiny, number=1, active_since_ns=1)
     with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
         archive.keep(EnsembleRecord(), (Activation(1, 0, stored),))
     vehicle.start('star_observer', 'attitude_timeout_s:=0.0', ros=REMAPS)

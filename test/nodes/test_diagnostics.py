@@ -122,7 +122,7 @@ def test_nodes_that_are_not_active(vehicle) -> None:
         assert set(values) == documented()
 
 
-def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_received(
+def test_a_silent_topic_is_warned_of_once_and_sensor_data_are_received(
     vehicle,
 ) -> None:
     """Best effort, as drivers offer it: all inputs connect, remapped or not."""
@@ -177,9 +177,8 @@ def test_a_driver_in_another_namespace_is_named(vehicle) -> None:
     vehicle.until(lambda: f'/image: {there}' in vehicle.health()[1])
     assert vehicle.health()[0] == b'\x01'
     answer = vehicle.call(Trigger, '/calibrator/calibrate')
-    assert answer.message.startswith(
-        f'no message on /observations: {there} and no subscriber; too'
-    )
+    words = f'no message on /observations: {there} and no subscriber; too'
+    assert answer.message.startswith(words)
     assert len(answer.message) <= 200
 
 

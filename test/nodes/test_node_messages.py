@@ -37,7 +37,6 @@ pytestmark = pytest.mark.nodes
 
 
 def through_wire(message: Any) -> Any:
-    """Return the message after serialisation and back."""
     return deserialize_message(serialize_message(message), type(message))
 
 

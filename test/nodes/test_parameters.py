@@ -50,10 +50,7 @@ def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path) -> None:
     other = tmp_path / 'other.yaml'
     other.write_text('/**/star_observer:\n  ros__parameters: {flat_field: flat.png}\n')
     given = ['--ros-args', '--params-file', str(params), '--params-file', str(other)]
-    camera = {
-        ('camera_info_url', 'camera.yaml'): tmp_path,
-        ('state_dir', 'here'): tmp_path,
-    }
+    camera = dict.fromkeys([('camera_info_url', 'camera.yaml'), ('state_dir', 'here')], tmp_path)
     assert folders_of_paths(given, '/calibrator') == camera
     flat = {('flat_field', 'flat.png'): tmp_path}
     assert folders_of_paths(given, '/star_observer') == camera | flat

@@ -28,7 +28,6 @@ from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     calibration_to_message,
 )
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
@@ -38,12 +37,11 @@ pytestmark = pytest.mark.nodes
 
 @pytest.fixture
 def observer(ros_domain: None, tiny_bag: Path) -> Iterator[StarObserver]:
-    """An active star observer in this process."""
     with in_this_process(StarObserver, tiny_bag) as node:
         yield node
 
 
-def test_the_worker_alone_changes_prediction_and_counts(observer, tiny_products) -> None:
+def test_the_worker_alone_changes_prediction_and_counts(observer, tiny) -> None:
     """A calibration that arrives while the worker measures waits for it."""
     busy, go_on, done = threading.Event(), threading.Event(), threading.Event()
 
@@ -53,8 +51,7 @@ def test_the_worker_alone_changes_prediction_and_counts(observer, tiny_products)
 
     observer._queue.call(hold)
     assert busy.wait(240.0)
-    active = read_calibration(tiny_products / CALIBRATION_FILE)
-    observer._on_calibration(calibration_to_message(active, make_message))
+    observer._on_calibration(calibration_to_message(tiny, make_message))
     prior = observer._setup.prior
     assert observer._geometry is prior
     observer._queue.call(done.set)
@@ -64,8 +61,8 @@ def test_the_worker_alone_changes_prediction_and_counts(observer, tiny_products)
 
 
 @pytest.mark.parametrize('changed', [{'child_frame': 'other'}, {'parent_frame': 'other'}])
-def test_a_calibration_of_other_frames_is_not_used(observer, tiny_products, changed) -> None:
-    other = replace(read_calibration(tiny_products / CALIBRATION_FILE), **changed)
+def test_a_calibration_of_other_frames_is_not_used(observer, tiny, changed) -> None:
+    other = replace(tiny, **changed)
     with pytest.raises(ValueError, match="'other'.*, not .'camera', 'star_tracker'"):
         observer._on_calibration(calibration_to_message(other, make_message))
 
