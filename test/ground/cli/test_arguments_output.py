@@ -35,10 +35,6 @@ def _prior_in_out(here: Path) -> None:
     )
 
 
-def _nothing(here: Path) -> None:
-    pass
-
-
 def _link(path: Path, target: Path) -> None:
     path.unlink(missing_ok=True)
     path.symlink_to(target)
@@ -54,10 +50,10 @@ def _picture(folder: Path) -> Path:
 _OWN = '--params HERE/bag/params.yaml -o'
 _IMPORT = 'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
 PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
-    'folder of the bag': (_nothing, f'calibrate HERE/bag {_OWN} HERE/bag'),
-    'folder of the file': (_nothing, f'calibrate HERE/bag/tiny_0.mcap {_OWN} HERE/bag'),
+    'folder of the bag': (Path.exists, f'calibrate HERE/bag {_OWN} HERE/bag'),
+    'folder of the file': (Path.exists, f'calibrate HERE/bag/tiny_0.mcap {_OWN} HERE/bag'),
     'observations of the folder': (
-        _nothing, f'calibrate HERE/out/observations.mcap {_OWN} HERE/out',
+        Path.exists, f'calibrate HERE/out/observations.mcap {_OWN} HERE/out',
     ),
     'link to the bag': (
         lambda here: _link(here / 'out/observations.mcap', here / 'bag/tiny_0.mcap'),
@@ -100,7 +96,7 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         f'{_IMPORT} HERE/frames/import.json -o HERE/frames',
     ),
     'straight image over its original': (
-        _nothing, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
+        Path.exists, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
     ),
     'straight images of one name': (
         lambda here: shutil.copytree(here / 'frames', here / 'others'),
