@@ -52,17 +52,13 @@ def test_attitude_errors_are_those_of_the_star_tracker(method) -> None:
     assert (np.sqrt((off**2).mean(axis=0)) < 0.25 * np.sqrt((varied**2).mean(axis=0))).all()
 
 
-def test_rms_of_images() -> None:
-    left = residuals()
+def test_rms_of_images_and_residuals_written_and_read(tmp_path) -> None:
+    left, path = residuals(), tmp_path / 'residuals.npz'
     for k, rms in enumerate(left.image_rms_px()):
         here = left.residual_px[(left.image == k) & left.used]
         assert rms == pytest.approx(np.sqrt(np.mean(here**2)), rel=1e-12)  # rounding
     nothing = dataclasses.replace(left, used=np.zeros_like(left.used))
     assert np.isnan(nothing.image_rms_px()).all()
-
-
-def test_written_and_read_is_equal(tmp_path) -> None:
-    left, path = residuals(), tmp_path / 'residuals.npz'
     write_residuals(left, path)
     again = read_residuals(path)
     for field in dataclasses.fields(left):
