@@ -16,17 +16,10 @@ import pytest
 from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
-BUILT = (
-    'CMakeLists.txt',
-    'package.xml',
-    'setup.cfg',
-    'msg',
-    'srv',
-    'starcal_ros',
-    'starcal_ground',
-)
+BUILT = ('CMakeLists.txt', 'package.xml', 'setup.cfg', 'msg', 'srv')
 TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README.md', 'LICENSE')
 INSTALLED = ('launch', 'config', 'bags/tiny')
+PACKAGES = ('starcal_ros', 'starcal_ground')
 NODE_STOPS_WITHIN_S = 240.0
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]
@@ -65,7 +58,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp('workspace')
     package = workspace / 'src' / 'starcal'
     package.mkdir(parents=True)
-    for name in filter(lambda name: (ROOT / name).exists(), BUILT + INSTALLED + TESTED):
+    for name in filter(lambda name: (ROOT / name).exists(), BUILT + PACKAGES + INSTALLED + TESTED):
         if (ROOT / name).is_dir():
             ignore = shutil.ignore_patterns('__pycache__')
             shutil.copytree(ROOT / name, package / name, ignore=ignore)
@@ -84,7 +77,6 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def colcon(workspace: Path, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run colcon in the workspace, on the environment as underlay."""
     underlay = {'AMENT_PREFIX_PATH': sys.prefix, 'CMAKE_PREFIX_PATH': sys.prefix}
     env = os.environ | underlay | {'COLCON_HOME': str(workspace)} | more
     made: subprocess.CompletedProcess[str] = run_python(

@@ -51,18 +51,12 @@ def test_from_bag(few_images, tmp_path) -> None:
     assert read_calibration(written).accepted
 
 
-def test_from_a_bag_that_is_not_there(tmp_path) -> None:
-    done = run_python(
-        EXAMPLES / 'from_bag.py', 'none', TINY / 'params.yaml', 'out.json', cwd=tmp_path
-    )
-    assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr == 'none: no such file or folder\n'
-
-
 @pytest.mark.slow
 def test_notebook(monkeypatch) -> None:
     """Each code cell in turn, in one namespace: what Jupyter does, without Jupyter."""
     cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
+    for cell in cells:  # it is kept without outputs
+        assert not cell.get('outputs') and cell.get('execution_count') is None
     sources = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
     assert len(sources) >= 5
     monkeypatch.chdir(EXAMPLES)
@@ -70,12 +64,6 @@ def test_notebook(monkeypatch) -> None:
     for number, source in enumerate(sources):
         exec(compile(source, f'cell {number}', 'exec'), names)
     assert 'calibration' in names
-
-
-def test_the_notebook_is_kept_without_outputs() -> None:
-    cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
-    for cell in cells:
-        assert not cell.get('outputs') and cell.get('execution_count') is None
 
 
 @pytest.mark.slow
@@ -91,12 +79,22 @@ def test_mission(few_images, tmp_path) -> None:
     assert (tmp_path / 'mission/camera.ti').read_text().startswith('KPL/IK')
 
 
-@pytest.mark.parametrize('name', ['from_bag.py', 'mission.py'])
-def test_without_arguments_the_usage_is_printed(name, tmp_path) -> None:
-    done = run_python(EXAMPLES / name, cwd=tmp_path)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f'usage: python {name} BAG PARAMS ')
-    assert done.stderr.count('\n') == 1
+@pytest.mark.parametrize(
+    ('name', 'given', 'words'),
+    [
+        ('from_bag.py', (), 'usage: python from_bag.py BAG PARAMS '),
+        ('mission.py', (), 'usage: python mission.py BAG PARAMS '),
+        (
+            'from_bag.py',
+            ('none', TINY / 'params.yaml', 'o.json'),
+            'none: no such file or folder\n',
+        ),
+    ],
+)
+def test_missing_arguments_and_a_missing_bag_are_one_line(name, given, words, tmp_path) -> None:
+    done = run_python(EXAMPLES / name, *given, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith(words) and done.stderr.count('\n') == 1
 
 
 PUBLIC = [

@@ -74,10 +74,9 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def unpacked(sources: Path) -> Path:
-    """The source archive, unpacked."""
     packed = run_python('-c', SDIST, cwd=sources)
     assert packed.returncode == 0, packed.stderr
-    archive = sources.parent / packed.stdout.splitlines()[-1]
+    archive: Path = sources.parent / packed.stdout.splitlines()[-1]
     run('tar', 'xzf', archive, cwd=sources.parent)
     return archive.with_suffix('').with_suffix('')
 
@@ -157,10 +156,8 @@ def test_a_bag_is_calibrated_without_extras(flight_install, tmp_path) -> None:
     )
     done = run(python, '-W', 'error', '-c', write, tiny, params, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
-    made, again = (
-        json.loads((tmp_path / name).read_text())
-        for name in ('out/calibration.json', 'again.json')
-    )
+    files = (tmp_path / 'out/calibration.json', tmp_path / 'again.json')
+    made, again = (json.loads(path.read_text()) for path in files)
     assert made['accepted'] and made['intrinsics'] == again['intrinsics']
 
 

@@ -60,9 +60,7 @@ def started(node: Path) -> Iterator[None]:
         process.kill()
 
 
-def test_it_answers_with_the_lines_of_sight_of_the_python_package(
-    client, started, tmp_path
-) -> None:
+def test_it_answers_with_lines_of_sight_of_the_python_package(client, started, tmp_path) -> None:
     answers = client.collect(Vector3Stamped, 'line_of_sight')
     client.until(lambda: client.node.count_publishers('line_of_sight'))
     pixels = client.publisher(PointStamped, 'pixel')
