@@ -241,7 +241,9 @@ time.sleep(60)
 """
 
 
-def test_calls_to_a_node_that_is_deactivated_or_one_of_two_are_answered(vehicle, filled) -> None:
+def test_calls_to_a_deactivated_node_are_answered_and_a_second_calibrator_is_named(
+    vehicle, filled
+) -> None:
     calls = [(vehicle.node.create_client(Calibrate, '/calibrator/solve'), Calibrate.Request())]
     for name in ('calibrate', 'rollback'):
         service = vehicle.node.create_client(Trigger, f'/calibrator/{name}')
