@@ -42,7 +42,6 @@ def drawn(count: int) -> Callable[[Any], Any]:
 
 @functools.cache
 def bag_setup() -> Setup:
-    """Return the setup of the bag in the repository."""
     return read_setup(BAG / 'params.yaml')
 
 

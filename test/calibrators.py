@@ -82,7 +82,6 @@ class Calibrators:
         self.states[process].close()
 
     def close_all(self) -> None:
-        """Release all folders."""
         for state in self.states.values():
             state.close()
 

@@ -283,6 +283,14 @@ def tiny_products(made_once: MadeOnce, tiny_bag: Path) -> Path:
     return made_once('tiny_products', calibrate)
 
 
+@pytest.fixture(scope='session')
+def tiny(tiny_products: Path) -> object:
+    """The calibration among them, with a real covariance."""
+    from starcal_ros.formats.products.product_files import read_calibration
+
+    return read_calibration(tiny_products / 'calibration.json')
+
+
 @pytest.fixture
 def client(ros_domain: None) -> Iterator[Client]:
     """A client node for one test."""

@@ -43,26 +43,21 @@ class ForkedProcess:
 
     @property
     def returncode(self) -> int | None:
-        """Exit status; None before the end."""
         return self._process.exitcode
 
     def poll(self) -> int | None:
-        """Return the same."""
         return self.returncode
 
     def wait(self, timeout: float | None = None) -> int:
-        """Return the exit status when the process has ended."""
         self._process.join(timeout)
         if self.returncode is None:
             raise subprocess.TimeoutExpired('a node', timeout or 0.0)
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal."""
         os.kill(self.pid, number)
 
     def kill(self) -> None:
-        """Send SIGKILL."""
         self._process.kill()
 
 

@@ -158,12 +158,7 @@ def write_fits(path: Path, image: Image, kind: str = 'uint16', **header: object)
     return path
 
 
-def write_aem(
-    path: Path,
-    system: str = 'utc',
-    frame: str = 'ICRF',
-    version: str = '1.0',
-) -> Path:
+def write_aem(path: Path, system: str = 'utc', frame: str = 'ICRF', version: str = '1.0') -> Path:
     """An AEM of the small bag in KVN, written by hand from CCSDS 504.0-B."""
     lines = [
         f'CCSDS_AEM_VERS = {version}',
@@ -231,11 +226,8 @@ def ephemeris_time(time_ns: int) -> float:
 
 def write_ck(folder: Path) -> list[Path]:
     """CK (type 3, linear), SCLK and LSK with the attitudes of the small bag."""
-    kernels = [
-        folder / 'attitude.bc',
-        write_sclk(folder / 'clock.tsc'),
-        write_lsk(folder / 'leap.tls'),
-    ]
+    clock, leap = write_sclk(folder / 'clock.tsc'), write_lsk(folder / 'leap.tls')
+    kernels = [folder / 'attitude.bc', clock, leap]
     spiceypy.kclear()
     for kernel in kernels[1:]:
         spiceypy.furnsh(str(kernel))

@@ -18,6 +18,7 @@ import sys
 import time
 
 import pytest
+from starcal_tool import run  # type: ignore[import-not-found]
 from vehicle import LoggedProcess, with_log  # type: ignore[import-not-found]
 
 BESIDE = Path(__file__).parents[2] / 'shared' / 'ros2tools' / 'install.sh'
@@ -50,8 +51,7 @@ def find_tools(made_once: Callable[..., Path]) -> Path:
         pytest.skip('the real ROS 2 tools beside this repository are built for Jazzy')
 
     def install(folder: Path) -> None:
-        command = [str(BESIDE), sys.prefix, str(folder)]
-        made = subprocess.run(command, capture_output=True, text=True, check=False)
+        made = run(BESIDE, sys.prefix, folder)
         if made.returncode:
             pytest.skip(f'the real ROS 2 tools are not for this Python: {made.stderr[-200:]}')
 
@@ -62,10 +62,7 @@ class RosTools:
     """Runs the tools and starts processes with them in their environment, on one middleware."""
 
     def __init__(self, tools: Path, rmw: str, logs: Path, more: Mapping[str, str]) -> None:
-        shown = subprocess.run(
-            ['bash', '-c', f'. {tools}/env.sh && env -0'], capture_output=True, check=True
-        )
-        lines = shown.stdout.decode().split('\0')
+        lines = run('bash', '-c', f'. {tools}/env.sh && env -0', check=True).stdout.split('\0')
         self.environment = dict(line.split('=', 1) for line in lines if '=' in line)
         self.environment |= {'PYTHONUNBUFFERED': '1', 'PYTHONFAULTHANDLER': '1'}
         self.environment |= {'RMW_IMPLEMENTATION': rmw, **more}
@@ -89,14 +86,8 @@ class RosTools:
         """
         deadline_s = time.monotonic() + RUN_S
         while True:
-            done = subprocess.run(
-                [self._ros2, *map(str, arguments)],
-                env=self.environment,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                timeout=timeout_s,
-                check=False,
+            done: subprocess.CompletedProcess[str] = run(
+                self._ros2, *arguments, env=self.environment, timeout=timeout_s, input=''
             )
             if 'Node not found' not in done.stderr or time.monotonic() > deadline_s:
                 return done

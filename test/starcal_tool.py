@@ -1,10 +1,12 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""What a command of the tool answers, and the form of each refusal."""
+"""What commands answer, and the form of each refusal of the tool."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+import subprocess
+import sys
+from typing import Any, NamedTuple
 
 
 class Answer(NamedTuple):
@@ -29,3 +31,13 @@ def assert_refused(answer: Answer, *words: str) -> None:
 
 
 Starcal = Callable[..., Answer]
+
+
+def run(*command: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A program that has run to its end, with its output as text."""
+    return subprocess.run([*map(str, command)], capture_output=True, text=True, **options)
+
+
+def run_python(*words: object, **options: Any) -> subprocess.CompletedProcess[str]:
+    """The same for the Python of the tests."""
+    return run(sys.executable, *words, **options)

@@ -34,9 +34,3 @@ def write(folder: Path, day: int, **changed: object) -> Path:
     stamps = {'first_image_ns': day * DAY_NS, 'time_ns': day * DAY_NS + 9}
     write_products(dataclasses.replace(calibration(), **stamps, **changed), folder)
     return folder
-
-
-def make_mission(tmp_path: Path) -> Path:
-    for day in range(8):
-        write(tmp_path / f'mission/{day}', day)
-    return tmp_path / 'mission'

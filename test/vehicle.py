@@ -43,7 +43,6 @@ class LoggedProcess:
         self.name, self._log, self.process = name, log, process
 
     def said(self) -> str:
-        """Return the output so far."""
         return self._log.read_text(errors='replace')
 
     def until_said(self, text: str) -> None:
@@ -132,6 +131,13 @@ def _seen(condition: Callable[..., object]) -> str:
     return ', '.join(f'{name} = {str(value)[:600]}' for name, value in newest.items())
 
 
+def latched_qos() -> Any:
+    """Quality of service of a latched topic."""
+    from rclpy.qos import DurabilityPolicy, QoSProfile
+
+    return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
 class Client:
     """A rclpy node that waits for conditions instead of sleeping."""
 
@@ -203,10 +209,7 @@ class Client:
 
     def latched(self, kind: Any, topic: str) -> list[Any]:
         """Return a list that collects the messages of a latched topic."""
-        from rclpy.qos import DurabilityPolicy, QoSProfile
-
-        qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-        return self.collect(kind, topic, qos)
+        return self.collect(kind, topic, latched_qos())
 
     def until_latched(self, kind: Any, topic: str) -> list[Any]:
         """Wait for a message of a latched topic; return the list that collects them."""
@@ -277,7 +280,6 @@ class Client:
         self.until_images(len(images))
 
     def close(self) -> None:
-        """Leave the graph."""
         self._executor.shutdown()
         self.node.destroy_node()
         self._context.try_shutdown()

@@ -10,15 +10,15 @@ from typing import Any
 from mission_files import write_pngs  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 from tiny_campaign import ensemble, SCENARIO  # type: ignore[import-not-found]
+from worlds import each_image  # type: ignore[import-not-found]
 
 import starcal_ground
 import starcal_ros
 from starcal_ros.assessment import lookup
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.records import Ensemble, StarObservations
+from starcal_ros.records import StarObservations
 
 SIGMA_ARCSEC = (10.0, 10.0, 40.0)
 TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
@@ -68,11 +68,8 @@ def test_arrays_give_the_estimate_of_the_records() -> None:
     )
     options = CalibrationOptions(star_tracker_sigma_arcsec=SIGMA_ARCSEC)
     # Arrays have no magnitudes, by which the variances would be told apart.
-    dark = Ensemble(
-        tuple(
-            dataclasses.replace(image, magnitude=np.full(len(image), np.nan, np.float32))
-            for image in ensemble().images
-        )
+    dark = each_image(
+        ensemble(), lambda _, image: {'magnitude': np.full(len(image), np.nan, np.float32)}
     )
     expected = estimate_calibration(dark, SCENARIO.prior, options)
     assert found.accepted and found.stars_used == expected.kept.sum()
@@ -94,9 +91,13 @@ def test_stars_of_equal_directions_are_one_star() -> None:
     assert len(np.unique(first.catalog_id)) == len(first)
 
 
-def test_one_covariance_serves_all_stars() -> None:
-    image = dict(arrays(ensemble().images[0]), covariance_px2=[[0.04, 0.01], [0.01, 0.09]])
-    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **image)
+def test_one_covariance_serves_all_stars_and_records_are_not_changed_by_the_caller() -> None:
+    image = ensemble().images[0]
+    mine = image.measured_px.copy()
+    one = {'measured_px': mine, 'covariance_px2': [[0.04, 0.01], [0.01, 0.09]]}
+    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **{**arrays(image), **one})
+    mine += 1.0
+    assert np.array_equal(stars.measured_px, image.measured_px)
     assert np.array_equal(stars.covariance_px2, np.tile([0.04, 0.01, 0.09], (len(stars), 1)))
 
 
@@ -119,16 +120,14 @@ def test_a_bad_array_is_named(argument, value, complaint) -> None:
         starcal_ground.observations_of(SCENARIO.prior.camera, **image)
 
 
-def test_options_are_checked_by_name() -> None:
-    with pytest.raises(starcal_ground.OptionError, match='did you mean method'):
-        starcal_ground.calibrate(ensemble().images, SCENARIO.prior, methd='single')
-    with pytest.raises(starcal_ground.OptionError, match='method: .* is not one of'):
-        starcal_ground.calibrate(ensemble().images, SCENARIO.prior, method='best')
-    with pytest.raises(starcal_ground.OptionError, match='prior_alignment: no such parameter'):
-        starcal_ground.calibrate(ensemble().images, SCENARIO.prior, prior_alignment=(0, 0, 0, 1))
-
-
-def test_too_few_images_are_refused() -> None:
+def test_options_are_checked_by_name_and_too_few_images_are_refused() -> None:
+    for option, words in (
+        ({'methd': 'single'}, 'did you mean method'),
+        ({'method': 'best'}, 'method: .* is not one of'),
+        ({'prior_alignment': (0, 0, 0, 1)}, 'prior_alignment: no such parameter'),
+    ):
+        with pytest.raises(starcal_ground.OptionError, match=words):
+            starcal_ground.calibrate(ensemble().images, SCENARIO.prior, **option)
     with pytest.raises(starcal_ground.TooFewObservations, match='1 more image .* needed'):
         starcal_ground.calibrate(ensemble().images[:2], SCENARIO.prior)
 
@@ -179,8 +178,8 @@ def test_lines_of_sight_are_of_either_frame() -> None:
     np.testing.assert_allclose(
         starcal_ground.project(geometry.camera, in_camera), pixels, rtol=0, atol=1e-8
     )
-    star_tracker_from_camera = Rotation.from_quat(geometry.star_tracker_from_camera_xyzw)
-    expected = star_tracker_from_camera.apply(in_camera.reshape(-1, 3)).reshape(2, 2, 3)
+    turn = geometry.star_tracker_from_camera
+    expected = turn.apply(in_camera.reshape(-1, 3)).reshape(2, 2, 3)
     found = starcal_ground.lines_of_sight(geometry, pixels, frame='star_tracker')
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-15)
     for back in (
@@ -193,32 +192,31 @@ def test_lines_of_sight_are_of_either_frame() -> None:
 
 
 @pytest.mark.parametrize('frame', ['camera', 'star_tracker'])
-def test_sigmas_of_lines_of_sight_are_those_of_the_table(tiny_products, frame) -> None:
-    calibration = starcal_ground.read_calibration(tiny_products)
+def test_sigmas_of_lines_of_sight_are_those_of_the_table(tiny, frame) -> None:
     pixels = np.array([[[0.0, 0.0], [100.0, 50.0]], [[319.5, 255.5], [639.0, 511.0]]])
     table = lookup.line_of_sight_table(
-        calibration.geometry.camera, calibration.map_covariance, pixels.reshape(-1, 2)
+        tiny.geometry.camera, tiny.map_covariance, pixels.reshape(-1, 2)
     )
-    found = starcal_ground.line_of_sight_sigma_arcsec(calibration, pixels, frame)
+    found = starcal_ground.line_of_sight_sigma_arcsec(tiny, pixels, frame)
     expected = table.shape_sigma_arcsec if frame == 'camera' else table.sigma_arcsec
     np.testing.assert_allclose(found, expected.reshape(2, 2), rtol=1e-9)  # rounding
     # No uncertainty is along the line of sight itself.
-    covariance = starcal_ground.line_of_sight_covariance(calibration, pixels, frame)
-    sights = starcal_ground.lines_of_sight(calibration, pixels, frame)
+    covariance = starcal_ground.line_of_sight_covariance(tiny, pixels, frame)
+    sights = starcal_ground.lines_of_sight(tiny, pixels, frame)
     along = np.einsum('...i,...ij,...j->...', sights, covariance, sights)
     assert (np.abs(along) < 1e-9 * np.trace(covariance, axis1=-2, axis2=-1)).all()
 
 
-def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny_products) -> None:
-    alone = dataclasses.replace(starcal_ground.read_calibration(tiny_products), parent_frame='')
+def test_the_camera_alone_has_no_frame_of_a_star_tracker(tiny) -> None:
+    alone = dataclasses.replace(tiny, parent_frame='')
     for camera in (alone, alone.geometry.camera):
         assert starcal_ground.lines_of_sight(camera, [1.0, 2.0]).shape == (3,)
         with pytest.raises(ValueError, match='the camera alone has no alignment'):
             starcal_ground.lines_of_sight(camera, [1.0, 2.0], 'star_tracker')
 
 
-def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products) -> None:
-    one, same = (starcal_ground.read_calibration(tiny_products) for _ in range(2))
+def test_a_calibration_is_shown_in_three_lines_and_compared(tiny, tiny_products) -> None:
+    one, same = tiny, starcal_ground.read_calibration(tiny_products)
     assert one == same and one != 'calibration'
     assert one != dataclasses.replace(one, covariance=2 * one.covariance)
     assert repr(one).count('\n') == 2 and len(repr(one)) < 300
@@ -226,12 +224,3 @@ def test_a_calibration_is_shown_in_three_lines_and_compared(tiny_products) -> No
     assert 'refused by the gate' in text and 'refused: a < b' in text
     fx, sigma = one.geometry.camera.parameters[0], one.sigma[0]
     assert f'{fx:.3f}' in text and f'1-sigma {sigma:.2g}' in text
-
-
-def test_records_are_not_changed_by_the_caller() -> None:
-    image = ensemble().images[0]
-    mine = image.measured_px.copy()
-    given = dict(arrays(image), measured_px=mine)
-    stars = starcal_ground.observations_of(SCENARIO.prior.camera, **given)
-    mine += 1.0
-    assert np.array_equal(stars.measured_px, image.measured_px)

@@ -3,13 +3,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 import os
 from pathlib import Path
-import subprocess
 import sys
 
 import pytest
+from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 from starcal_ground.child_process import module_command
 
@@ -29,10 +28,7 @@ def hostile(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run a program in a folder, with the packages of this tree."""
-    environment = {**os.environ, 'PYTHONPATH': str(ROOT)}
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
+WITH_THIS_TREE = {**os.environ, 'PYTHONPATH': str(ROOT)}
 
 
 @pytest.mark.slow
@@ -51,14 +47,14 @@ def run(command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str
 )
 def test_modules_of_the_current_folder_are_not_run(hostile, few_images, start, arguments) -> None:
     given = [word.replace('BAG', str(few_images)) for word in arguments]
-    done = run([*start, *given], hostile)
+    done = run(*start, *given, cwd=hostile, env=WITH_THIS_TREE)
     assert done.returncode == 0, done.stderr
     assert not (hostile / 'marks').exists(), (hostile / 'marks').read_text()
 
 
 def test_the_marks_are_left_without_the_safe_path(hostile) -> None:
     """The test above could fail."""
-    subprocess.run([sys.executable, '-c', 'import yaml'], cwd=hostile, check=True)
+    run_python('-c', 'import yaml', cwd=hostile, check=True)
     assert (hostile / 'marks').read_text() == 'yaml\n'
 
 
@@ -66,5 +62,5 @@ def test_other_programs_keep_their_path(tmp_path) -> None:
     (tmp_path / 'program.py').write_text('import starcal_ros, beside; print(beside.NAME)')
     (tmp_path / 'beside.py').write_text("NAME = 'beside'")
     for command in (['-m', 'program'], ['program.py']):
-        done = run([sys.executable, *command], tmp_path)
+        done = run_python(*command, cwd=tmp_path, env=WITH_THIS_TREE)
         assert done.stdout == 'beside\n', done.stderr

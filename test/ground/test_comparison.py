@@ -10,9 +10,10 @@ from pathlib import Path
 import shutil
 from typing import Any
 
+import cv2
+from geometries import turned  # type: ignore[import-not-found]
 from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
-from opencv_points import undistorted  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
@@ -25,41 +26,28 @@ from starcal_ros.camera import CameraModel, PARAMETER_NAMES, pixel_grid
 from starcal_ros.camera.projection import convert
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, TemperatureTerms
 
 Compared = Callable[..., tuple[str, dict[str, Any]]]
-
-
-@pytest.fixture(scope='module')
-def tiny(tiny_products: Path) -> Calibration:
-    """The calibration of the tiny bag: a real covariance."""
-    return read_calibration(tiny_products / 'calibration.json')
 
 
 def moved(
     calibration: Calibration, turned_rad: tuple[float, ...] = (0.0, 0.0, 0.0), **by: float
 ) -> Calibration:
     """A calibration with some parameters changed, and the camera frame turned."""
-    camera, quaternion = (
-        calibration.geometry.camera,
-        calibration.geometry.star_tracker_from_camera_xyzw,
-    )
+    geometry, camera = calibration.geometry, calibration.geometry.camera
     parameters = camera.parameters.copy()
     for name, change in by.items():
         parameters[PARAMETER_NAMES.index(name)] += change
-    turned = Rotation.from_quat(quaternion) * Rotation.from_rotvec(turned_rad)
-    geometry = dataclasses.replace(
-        calibration.geometry,
-        camera=CameraModel(camera.width, camera.height, parameters),
-        star_tracker_from_camera_xyzw=turned.as_quat(),
+    camera = CameraModel(camera.width, camera.height, parameters)
+    geometry = turned(
+        dataclasses.replace(geometry, camera=camera), Rotation.from_rotvec(turned_rad)
     )
     return dataclasses.replace(calibration, geometry=geometry)
 
 
 @pytest.fixture
 def compared(tmp_path: Path, starcal: Starcal) -> Compared:
-    """Text and JSON object of `starcal compare`."""
 
     def run(*calibrations: Calibration) -> tuple[str, dict[str, Any]]:
         files = [tmp_path / f'{name}.json' for name in 'ab']
@@ -79,8 +67,22 @@ def test_nothing_differs_from_itself(tiny) -> None:
     assert found.after.length_px.max() < 1e-11
 
 
+def undistorted(camera: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+    """Points (n, 2) of the ideal image plane by OpenCV, to its last digit; it has no skew."""
+    fx, skew, fy, cx, cy, k1, k2, k3, p1, p2 = camera
+    assert skew == 0
+    K, D = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]), np.array([k1, k2, p1, p2, k3])
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 500, 1e-15)
+    if hasattr(cv2, 'undistortPointsIter'):
+        found = cv2.undistortPointsIter(pixels[:, None], K, D, np.eye(3), np.eye(3), criteria)
+    else:  # from OpenCV 5 on, whose stubs those of 4 are not
+        undistort: Any = cv2.undistortPoints
+        found = undistort(pixels[:, None], K, D, criteria=criteria)
+    return np.asarray(found, np.float64).reshape(-1, 2)
+
+
 def opencv_sight(calibration: Calibration) -> np.ndarray:
-    """Lines of sight of the grid in the star tracker frame by OpenCV, which knows no skew."""
+    """Lines of sight of the grid in the star tracker frame by OpenCV."""
     camera = calibration.geometry.camera
     xy = undistorted(camera.parameters, pixel_grid(camera, GRID, GRID))
     directions = np.c_[xy, np.ones(len(xy))]
@@ -138,7 +140,7 @@ def test_sigmas_of_the_maps_are_those_of_the_table(tiny) -> None:
     assert made['alignment_arcsec'] == pytest.approx(expected_arcsec, rel=1e-12)
 
 
-def test_a_reference_temperature_of_one_alone_is_noted(tiny) -> None:
+def test_notes_say_what_weakens_the_sigmas(tiny) -> None:
     terms = TemperatureTerms(20.0, (), (), (), ())
     at_20, at_25 = (
         dataclasses.replace(tiny, temperature=dataclasses.replace(terms, reference_degc=degc))
@@ -147,6 +149,12 @@ def test_a_reference_temperature_of_one_alone_is_noted(tiny) -> None:
     for a, b, noted in ((tiny, at_20, True), (at_20, at_20, False), (at_20, at_25, True)):
         notes = compare(a, b).notes
         assert any('different temperatures' in note for note in notes) is noted
+    refused = dataclasses.replace(
+        tiny, accepted=False, reasons=('too bad',), parent_frame='other', provenance={}
+    )
+    notes = compare(tiny, refused).notes
+    assert any('refused B: too bad' in note for note in notes)
+    assert any('other' in note for note in notes)
 
 
 def test_what_was_held_has_no_sigma(tiny) -> None:
@@ -183,22 +191,13 @@ def test_common_images_are_noted_whatever_the_prior(tiny, stamps_ns, later_ns, n
     assert [f'A and B {noted}' in note for note in notes] == [True] * bool(noted)
 
 
-def test_notes_say_what_weakens_the_sigmas(tiny) -> None:
-    refused = dataclasses.replace(
-        tiny, accepted=False, reasons=('too bad',), parent_frame='other', provenance={}
-    )
-    notes = compare(tiny, refused).notes
-    assert any('refused B: too bad' in note for note in notes)
-    assert any('other' in note for note in notes)
-
-
 def test_cameras_alone_are_compared_without_an_alignment(tiny, compared) -> None:
     """Their alignment is of the prior camera: 82 arcsec of sigma, and no fit of any size."""
     alone = dataclasses.replace(tiny, parent_frame='')
-    turned = dataclasses.replace(moved(tiny, (1e-2, 0.0, 0.0), fx=0.01), parent_frame='')
-    found = compare(alone, turned)
+    other = dataclasses.replace(moved(tiny, (1e-2, 0.0, 0.0), fx=0.01), parent_frame='')
+    found = compare(alone, other)
     assert found.total.degrees_of_freedom == 10 and found.total.p_value > 0.99
-    said, content = compared(alone, turned)
+    said, content = compared(alone, other)
     assert 'alignment x' not in said and 'as calibrated' not in said
     assert 'the cameras alone are compared' in said and '10 degrees of freedom' in said
     assert content['alignment_arcsec'] is content['lines_of_sight'] is None

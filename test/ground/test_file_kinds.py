@@ -12,6 +12,7 @@ import sqlite3
 import subprocess
 import sys
 
+from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -26,7 +27,6 @@ from starcal_ros.errors import BagError
 from starcal_ros.formats.messages.message_codec import ATTITUDE_TYPE
 from starcal_ros.records import Image
 
-TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 ATTITUDE = np.array([0.0, 0.0, 0.0, 1.0])
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import errno
 import os
-from pathlib import Path
 
 import pytest
 
@@ -55,7 +54,7 @@ def test_a_file_is_recognised_by_any_name(tmp_path) -> None:
     assert not same_as_one_of(tmp_path / 'none', [tmp_path / 'none'])
 
 
-def test_a_file_is_known_until_it_is_changed(tmp_path: Path) -> None:
+def test_a_file_is_known_until_it_is_changed(tmp_path) -> None:
     path = tmp_path / 'a'
     with replacing(path) as file:
         file.write(b'new')
@@ -82,7 +81,7 @@ def test_a_file_is_known_until_it_is_changed(tmp_path: Path) -> None:
     ],
 )
 def test_a_page_is_known_where_a_file_system_keeps_no_attributes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, change: bytes, is_known: bool
+    tmp_path, monkeypatch, name, change, is_known
 ) -> None:
     def unsupported(*_: object) -> None:
         raise OSError(errno.ENOTSUP, 'Operation not supported')

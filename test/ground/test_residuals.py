@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -31,7 +30,7 @@ def residuals(method: str = 'hierarchical') -> Residuals:
 
 
 @pytest.mark.parametrize('method', METHODS)
-def test_attitude_errors_are_those_of_the_star_tracker(method: str) -> None:
+def test_attitude_errors_are_those_of_the_star_tracker(method) -> None:
     """Whatever the method: the stars show the errors that the simulation has put in."""
     left, put_in = residuals(method), []
     for index in range(SCENARIO.image_count):
@@ -53,17 +52,13 @@ def test_attitude_errors_are_those_of_the_star_tracker(method: str) -> None:
     assert (np.sqrt((off**2).mean(axis=0)) < 0.25 * np.sqrt((varied**2).mean(axis=0))).all()
 
 
-def test_rms_of_images() -> None:
-    left = residuals()
+def test_rms_of_images_and_residuals_written_and_read(tmp_path) -> None:
+    left, path = residuals(), tmp_path / 'residuals.npz'
     for k, rms in enumerate(left.image_rms_px()):
         here = left.residual_px[(left.image == k) & left.used]
         assert rms == pytest.approx(np.sqrt(np.mean(here**2)), rel=1e-12)  # rounding
     nothing = dataclasses.replace(left, used=np.zeros_like(left.used))
     assert np.isnan(nothing.image_rms_px()).all()
-
-
-def test_written_and_read_is_equal(tmp_path: Path) -> None:
-    left, path = residuals(), tmp_path / 'residuals.npz'
     write_residuals(left, path)
     again = read_residuals(path)
     for field in dataclasses.fields(left):
@@ -73,7 +68,7 @@ def test_written_and_read_is_equal(tmp_path: Path) -> None:
     assert path.read_bytes() == first
 
 
-def test_columns_that_do_not_fit_are_named(tmp_path: Path) -> None:
+def test_columns_that_do_not_fit_are_named(tmp_path) -> None:
     """Files that are no archives are those of any reader: test_untrusted_files.py."""
     left, path = residuals(), tmp_path / 'residuals.npz'
     for wrong, words in (

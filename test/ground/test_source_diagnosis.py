@@ -29,6 +29,7 @@ from starcal_ros.records import Image, refused_image
 
 PARAMS = TINY / 'params.yaml'
 ASKED = Topics()
+ALONE = [(5, np.array([0.0, 0.0, 0.0, 1.0]))]  # no attitude of the images
 IMAGE, ATTITUDE = simulated_bag.IMAGE_TOPIC, simulated_bag.ATTITUDE_TOPIC
 
 
@@ -124,8 +125,7 @@ def test_verdicts_are_those_of_the_calibration(spoilt, setup) -> None:
 
 def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path, starcal) -> None:
     """An image without attitudes on both sides has no gap; JSON, which has no NaN, holds null."""
-    alone = [(0, np.array([0.0, 0.0, 0.0, 1.0]))]
-    path = write_tiny(tmp_path / 'images.mcap', tiny_images()[:1], alone)
+    path = write_tiny(tmp_path / 'images.mcap', tiny_images()[:1], ALONE)
     assert math.isnan(contents_of(path).longest_attitude_gap_s)
     status, out, _ = starcal('diagnose', path, '--json')
     assert json.loads(out)['contents']['longest_attitude_gap_s'] is None
@@ -134,7 +134,7 @@ def test_an_attitude_gap_that_is_not_recorded_is_nan(tmp_path, starcal) -> None:
     assert status == EXIT_REFUSED and 'longest attitude gap' not in out
 
 
-def test_the_topics_are_told(spoilt) -> None:
+def test_the_topics_are_told_also_of_a_cut_bag(spoilt, tmp_path) -> None:
     attitude, image = sorted(contents_of(spoilt).topics, key=lambda t: -t.bad)
     assert (attitude.name, attitude.bad) == (ATTITUDE, 4)
     assert attitude.rate_hz == pytest.approx(2.0) and attitude.count == 34
@@ -143,6 +143,14 @@ def test_the_topics_are_told(spoilt) -> None:
     assert image.rate_hz == pytest.approx(0.25) and image.longest_gap_s == pytest.approx(10.0)
     assert image.first_ns == tiny_images()[0].time_ns
     assert image.last_ns == tiny_images()[-1].time_ns + 10**10
+    # A cut one is read as far as it goes.
+    cut = tmp_path / 'cut.mcap'
+    cut.write_bytes(spoilt.read_bytes()[:-10_000])  # in the second chunk
+    found = contents_of(cut)
+    (damage,) = found.damage
+    assert 'truncated' in damage
+    (images,) = (t.count for t in found.topics if t.name == IMAGE)
+    assert 0 < images < 10 and found.images == images
 
 
 def test_what_the_bag_holds_besides_is_listed_and_told_by_recording_time(tmp_path) -> None:
@@ -177,16 +185,6 @@ def test_compressed_images_are_told_apart(tmp_path) -> None:
     assert {r.reason: r.count for r in found.refused} == {'bad_encoding': 1}
 
 
-def test_a_cut_bag_is_read_as_far_as_it_goes(spoilt, tmp_path) -> None:
-    cut = tmp_path / 'cut.mcap'
-    cut.write_bytes(spoilt.read_bytes()[:-10_000])  # in the second chunk
-    found = contents_of(cut)
-    (damage,) = found.damage
-    assert 'truncated' in damage
-    (images,) = (t.count for t in found.topics if t.name == IMAGE)
-    assert 0 < images < 10 and found.images == images
-
-
 def test_recorded_observations_need_no_parameters(tiny_products, starcal) -> None:
     path = tiny_products / 'observations.mcap'
     found = contents_of(path)
@@ -205,8 +203,7 @@ def test_the_tool_shows_the_verdicts_without_parameters(spoilt, starcal) -> None
 
 
 def test_a_bag_that_cannot_be_calibrated_ends_with_3(tmp_path, starcal) -> None:
-    alone = [(5, np.array([0.0, 0.0, 0.0, 1.0]))]
-    path = write_tiny(tmp_path / 'two.mcap', tiny_images()[:2], alone)
+    path = write_tiny(tmp_path / 'two.mcap', tiny_images()[:2], ALONE)
     status, out, _ = starcal('diagnose', path)
     assert status == 3
     assert 'Cannot be calibrated: 2 different images, 3 are needed' in out and 'no_attitude' in out

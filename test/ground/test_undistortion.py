@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 from astropy.io import fits
@@ -20,16 +19,10 @@ from starcal_ground.written_files import write_calibration
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import Calibration, PIXELS_OF
 
 _ELECTRONS = 1e5  # of a star: its brightest pixel has half of the range of the detector
 _HALF_PX = 4
-
-
-@pytest.fixture(scope='module')
-def made(tiny_products: Path) -> Calibration:
-    return read_calibration(tiny_products / 'calibration.json')
 
 
 def of_camera(made: Calibration, camera: CameraModel) -> Calibration:
@@ -52,20 +45,20 @@ def centroid_px(values: Any, near_px: Floats) -> Floats:
 
 
 @pytest.mark.parametrize('k1', [-0.3, 0.3])
-def test_stars_are_where_a_pinhole_camera_has_them(made, k1) -> None:
-    tiny = synthetic.scenario('tiny')
-    nominal = tiny.truth.camera
+def test_stars_are_where_a_pinhole_camera_has_them(tiny, k1) -> None:
+    given = synthetic.scenario('tiny')
+    nominal = given.truth.camera
     camera = nominal.replace(k1=k1, skew=0.5, fy=1.01 * float(nominal.parameters[2]))
-    tiny = dataclasses.replace(tiny, truth=dataclasses.replace(tiny.truth, camera=camera))
+    given = dataclasses.replace(given, truth=dataclasses.replace(given.truth, camera=camera))
     stars_px = (
         np.random.default_rng(3).uniform(-0.5, 0.5, (30, 2))
         + pixel_grid(camera, 8, 7)[np.r_[9:15, 17:23, 25:31, 33:39, 41:47]]
     )
     shown = dataclasses.replace(
-        synthetic.scene(tiny, 1), pixel_px=stars_px, flux_electrons=np.full(30, _ELECTRONS)
+        synthetic.scene(given, 1), pixel_px=stars_px, flux_electrons=np.full(30, _ELECTRONS)
     )
-    image = rendering.render(tiny, shown, 1)
-    values = cv2.remap(image.pixels, *undistort_maps(of_camera(made, camera)), cv2.INTER_LANCZOS4)
+    image = rendering.render(given, shown, 1)
+    values = cv2.remap(image.pixels, *undistort_maps(of_camera(tiny, camera)), cv2.INTER_LANCZOS4)
     expected_px = project(straight_camera(camera), line_of_sight(camera, stars_px))
     error_px = np.array([centroid_px(values, px) - px for px in expected_px])
     assert np.abs(expected_px - stars_px).max() > 2.0
@@ -73,10 +66,10 @@ def test_stars_are_where_a_pinhole_camera_has_them(made, k1) -> None:
     assert np.abs(error_px).max() < 0.03
 
 
-def test_images_of_any_kind_are_straightened(made, tmp_path, starcal) -> None:
+def test_images_of_any_kind_are_straightened(tiny, tmp_path, starcal) -> None:
     """As stored: colours, bits and types; with the camera that they are of then."""
-    write_calibration(made, tmp_path / 'calibration.json')
-    height, width = made.geometry.camera.height, made.geometry.camera.width
+    write_calibration(tiny, tmp_path / 'calibration.json')
+    height, width = tiny.geometry.camera.height, tiny.geometry.camera.width
     ramp = np.tile(np.arange(width, dtype=np.uint16), (height, 1))
     photos = tmp_path / 'photos'
     photos.mkdir()
@@ -95,34 +88,32 @@ def test_images_of_any_kind_are_straightened(made, tmp_path, starcal) -> None:
     }
     assert [values.dtype for values in read.values()] == [np.uint16, np.uint8, np.float32]
     assert read['colours.jpg'].shape == (height, width, 3)
-    map_u, map_v = undistort_maps(made)
+    map_u, map_v = undistort_maps(tiny)
     inside = (map_u > 4) & (map_u < width - 5) & (map_v > 4) & (map_v < height - 5)
     # A ramp has the value of its pixel; OpenCV interpolates at a 32nd of one.
     assert np.abs(read['ramp.tiff'] - map_u)[inside].max() < 1.0 / 32.0
     straight = read_camera_info(tmp_path / 'straight' / 'camera_info.yaml')
     assert not straight.distortion.any()
     assert straight.parameters[:5].tolist() == pytest.approx(
-        straight_camera(made.geometry.camera).parameters[:5].tolist()
+        straight_camera(tiny.geometry.camera).parameters[:5].tolist()
     )
 
 
 @pytest.mark.parametrize(
     ('flip', 'read'), [('top-bottom', np.s_[::-1]), ('left-right', np.s_[:, ::-1])]
 )
-def test_mirrored_files_are_mirrored_back_and_that_is_said(
-    made, tmp_path, starcal, flip, read
-) -> None:
+def test_mirrored_files_are_mirrored_back_and_said_so(tiny, tmp_path, starcal, flip, read) -> None:
     """As `starcal calibrate` did, which found that their stars are mirrored."""
     plain = np.random.default_rng(1).integers(0, 255, (512, 640), np.uint8)
     cv2.imwrite(str(tmp_path / 'plain.png'), plain)
     cv2.imwrite(str(tmp_path / 'mirrored.png'), plain[read])
-    provenance = {**made.provenance, PIXELS_OF: f'{MIRRORED[flip]}: as the stars show'}
-    mirrored = dataclasses.replace(made, provenance=provenance)
-    maps = undistort_maps(made)
-    undistort_file(tmp_path / 'plain.png', made, maps, tmp_path / 'a.png')
+    provenance = {**tiny.provenance, PIXELS_OF: f'{MIRRORED[flip]}: as the stars show'}
+    mirrored = dataclasses.replace(tiny, provenance=provenance)
+    maps = undistort_maps(tiny)
+    undistort_file(tmp_path / 'plain.png', tiny, maps, tmp_path / 'a.png')
     undistort_file(tmp_path / 'mirrored.png', mirrored, maps, tmp_path / 'b.png')
     assert (tmp_path / 'a.png').read_bytes() == (tmp_path / 'b.png').read_bytes()
-    for calibration, words in ((made, False), (mirrored, True)):
+    for calibration, words in ((tiny, False), (mirrored, True)):
         write_calibration(calibration, tmp_path / 'calibration.json')
         said = starcal('undistort', tmp_path, tmp_path / 'plain.png', '-o', tmp_path / 'o').words
         assert (f'{MIRRORED[flip]}, as the images of the calibration were' in said) is words

@@ -26,7 +26,6 @@ class WithoutRos(pytest.Module):
     """A file of tests that cannot be imported here."""
 
     def collect(self) -> Iterator[pytest.Item]:
-        """Skip the file with the reason."""
         pytest.skip(f'{MISSING[0]} is not installed')
 
 

@@ -19,7 +19,6 @@ from rclpy.executors import SingleThreadedExecutor
 from sample_records import assert_same, observations  # type: ignore[import-not-found]
 from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
-from vehicle import Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import StarObservations
 from starcal_ground.bag_writer import BagWriter
@@ -72,9 +71,7 @@ def bag(tmp_path: Path) -> Path:
     return tmp_path / 'bag'
 
 
-def test_compressed_images_are_paced_for_the_node_that_observes(
-    vehicle: Vehicle, bag: Path
-) -> None:
+def test_compressed_images_are_paced_for_the_node_that_observes(vehicle, bag) -> None:
     """
     A queue of twenty overflows where they are not; each is answered once, in order.
 
@@ -99,9 +96,7 @@ def test_compressed_images_are_paced_for_the_node_that_observes(
     assert 'playing anyway' not in player.said()
 
 
-def test_what_was_latched_is_latched(
-    vehicle: Vehicle, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_latched_is_latched(vehicle, tmp_path, monkeypatch) -> None:
     """As /tf_static, whose listeners connect to no publisher of another durability."""
     as_recorded = {**typestore.offered_qos(), 'durability': 'transient_local'}
     monkeypatch.setattr(typestore, 'offered_qos', lambda: as_recorded)
@@ -114,17 +109,14 @@ def test_what_was_latched_is_latched(
     assert player.wait() == 0 and [one.data for one in found] == ['kept']
 
 
-def test_of_several_types_on_a_topic_one_is_played(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_of_several_types_on_a_topic_one_is_played(vehicle, tmp_path) -> None:
     """The bytes of the others went out as messages of it; a name of another tool ended it."""
     with BagWriter(tmp_path / 'mixed.mcap') as writer:
         for k, topic in enumerate(('/mixed', '/mixed', '/mixed', '/of another tool')):
-            kind = 'std_msgs/msg/String' if k != 1 else TEMPERATURE_TYPE
-            header = make_header(k, '', make_message)
-            fields = (
-                {'data': str(k)}
-                if k != 1
-                else {'header': header, 'temperature': 0.0, 'variance': 0.0}
-            )
+            kind, fields = 'std_msgs/msg/String', dict[str, Any](data=str(k))
+            if k == 1:
+                kind, header = TEMPERATURE_TYPE, make_header(k, '', make_message)
+                fields = {'header': header, 'temperature': 0.0, 'variance': 0.0}
             writer._channels.pop(topic, None)
             writer.write(topic, kind, k, make_message(kind, **fields))
     found: list[Any] = vehicle.collect(String, '/mixed')
@@ -135,9 +127,7 @@ def test_of_several_types_on_a_topic_one_is_played(vehicle: Vehicle, tmp_path: P
     assert 'String is on no topic that ROS can have: skipped' in player.said()
 
 
-def test_messages_of_another_version_are_played_as_those_of_this_one(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_messages_of_another_version_are_played_as_those_of_this_one(vehicle, tmp_path) -> None:
     """Their bytes went out as they were, and their fields were read as others."""
     now = typestore.described(OBSERVATIONS_TYPE)[0]
     definition = now.replace('string detail\n', 'float64 later\n')
@@ -163,9 +153,8 @@ def test_messages_of_another_version_are_played_as_those_of_this_one(
     assert other == []
     for one in found:
         assert_same(observations_from_message(one), replace(observations(), detail=''))
-    assert (
-        player.said().count('/other: starcal/msg/StarObservations is defined in the bag as') == 1
-    )
+    words = '/other: starcal/msg/StarObservations is defined in the bag as'
+    assert player.said().count(words) == 1
 
 
 def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:

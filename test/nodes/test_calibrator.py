@@ -30,7 +30,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo, Image
 from sensor_msgs.srv import SetCameraInfo
 from std_srvs.srv import Trigger
-from vehicle import Client, IMAGES, in_this_process, REMAPS, tiny_observations, Vehicle  # type: ignore[import-not-found]
+from vehicle import Client, IMAGES, in_this_process, REMAPS, tiny_observations  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration
 from starcal_ground.bags import reader
@@ -40,7 +40,6 @@ from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     camera_info_to_message,
 )
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Activation
 from starcal_ros.records import Ensemble as EnsembleRecord
 from starcal_ros.ros.archive import Archive
@@ -60,7 +59,7 @@ def calibrator(ros_domain: None, tiny_bag: Path) -> Iterator[Calibrator]:
         yield node
 
 
-def test_what_is_latched_is_what_is_active(client: Client, calibrator: Calibrator) -> None:
+def test_what_is_latched_is_what_is_active(client, calibrator) -> None:
     """The thread of the earlier of two activations may be the last to publish."""
     state = calibrator._state
     assert state.solve().success
@@ -89,7 +88,7 @@ def test_what_is_latched_is_what_is_active(client: Client, calibrator: Calibrato
     assert alignments == [alignment_to_message(active, make_message)]
 
 
-def test_diagnostics_are_of_the_limits_of_today(client: Client, calibrator: Calibrator) -> None:
+def test_diagnostics_are_of_the_limits_of_today(client, calibrator) -> None:
     """Cleaned up, configured with a tighter limit, and back, in one process."""
     assert calibrator._on_calibrate(None, Trigger.Response()).success
     latched: list[Any] = client.latched(CameraInfo, 'camera_info')
@@ -113,7 +112,7 @@ def test_diagnostics_are_of_the_limits_of_today(client: Client, calibrator: Cali
     client.until(lambda: latched[-1].k[0] > 0)
 
 
-def test_a_transition_is_in_the_diagnostics_at_once(calibrator: Calibrator) -> None:
+def test_a_transition_is_in_the_diagnostics_at_once(calibrator) -> None:
     service: Any
     (service,) = (one for one in calibrator.services if one.srv_type is ChangeState)
     for transition, level in ((DEACTIVATE, WARN), (ACTIVATE, OK)):
@@ -128,9 +127,7 @@ def transform(frame: str, x: float) -> TransformStamped:
     return made
 
 
-def test_a_transform_of_another_node_is_named(
-    calibrator: Calibrator, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_transform_of_another_node_is_named(calibrator, monkeypatch) -> None:
     """Only to a frame that this node publishes too, and not its own message."""
     monkeypatch.setattr(calibrator, 'count_publishers', lambda topic: 2)
     own = transform(calibrator._setup.frames.camera_frame, 0.0)
@@ -168,7 +165,6 @@ rclpy.spin(node)
 
 @contextmanager
 def driver(kept: Path) -> Iterator[None]:
-    """A camera driver in a process of its own."""
     process = subprocess.Popen([sys.executable, '-c', DRIVER, str(kept), SERVICE])
     try:
         yield
@@ -178,7 +174,6 @@ def driver(kept: Path) -> Iterator[None]:
 
 
 def until_told(client: Client, outcome: str, level: bytes) -> None:
-    """Wait for the level and the outcome of the driver in the diagnostics."""
 
     def is_so() -> bool:
         newest, _, values = client.health('calibrator')
@@ -187,7 +182,7 @@ def until_told(client: Client, outcome: str, level: bytes) -> None:
     client.until(is_so)
 
 
-def test_driver_is_told_and_its_failures_are_seen(vehicle: Vehicle) -> None:
+def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
     """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
     calibrator = vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
     vehicle.calibrate()
@@ -222,17 +217,13 @@ def test_driver_is_told_and_its_failures_are_seen(vehicle: Vehicle) -> None:
     vehicle.calibrate()
     vehicle.until(lambda: len(received) > before)
     said = calibrator.said()
-    for outcome in (
-        'service not available',
-        'no answer within 5 s',
-        'refused: sensor busy',
-        'accepted',
-    ):
+    failures = ('service not available', 'no answer within 5 s', 'refused: sensor busy')
+    for outcome in (*failures, 'accepted'):
         assert f'{SERVICE}: {outcome}' in said
     assert 'Traceback' not in said
 
 
-def test_a_driver_process_that_restarts(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_a_driver_process_that_restarts(vehicle, tmp_path) -> None:
     """
     A driver in another process receives the calibration that was active before it started.
 
@@ -250,24 +241,18 @@ def test_a_driver_process_that_restarts(vehicle: Vehicle, tmp_path: Path) -> Non
 
 
 # How the heir of a calibrator differs, and why it has no active calibration.
+STRICT = ('max_change_px:=1e-6',)
 HEIRS = {
-    'stricter limits': (
-        ('max_change_px:=1e-6',),
-        'state',
-        'calibration 1 is not active, the gate',
-    ),
+    'stricter limits': (STRICT, 'state', 'calibration 1 is not active, the gate'),
     'an empty folder': ((), 'empty', ''),
 }
 
 
 @pytest.mark.parametrize('name', HEIRS)
-def test_consumers_return_to_the_prior(
-    vehicle: Vehicle, name: str, tiny_products: Path, tmp_path: Path
-) -> None:
+def test_consumers_return_to_the_prior(vehicle, name, tiny, tmp_path) -> None:
     """The star observer, the camera of each image, and the monitor; and back to a calibration."""
     values, folder, why = HEIRS[name]
-    stored = read_calibration(tiny_products / CALIBRATION_FILE)
-    stored = dataclasses.replace(stored, number=1, active_since_ns=1)
+    stored = dataclasses.replace(tiny, number=1, active_since_ns=1)
     with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:
         archive.keep(EnsembleRecord(), (Activation(1, 0, stored),))
     vehicle.start('star_observer', 'attitude_timeout_s:=0.0', ros=REMAPS)

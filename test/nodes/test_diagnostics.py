@@ -15,7 +15,7 @@ import pytest
 from rclpy.qos import qos_profile_sensor_data, QoSProfile
 from sensor_msgs.msg import Image, Temperature
 from std_srvs.srv import Trigger
-from vehicle import ATTITUDES, BOTH, IMAGES, REMAPS, tiny_observations, Vehicle  # type: ignore[import-not-found]
+from vehicle import ATTITUDES, BOTH, IMAGES, REMAPS, tiny_observations  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal_ground.bags import reader
@@ -43,7 +43,7 @@ def documented(*tables: str) -> set[str]:
     return keys
 
 
-def test_observer_says_what_the_document_says(vehicle: Vehicle) -> None:
+def test_observer_says_what_the_document_says(vehicle) -> None:
     vehicle.start('star_observer', 'attitude_timeout_s:=60.0', ros=REMAPS)
     vehicle.until(lambda: vehicle.health()[1] == 'waiting for images')
     level, _, values = vehicle.health()
@@ -70,7 +70,7 @@ def test_observer_says_what_the_document_says(vehicle: Vehicle) -> None:
     assert values['callback_errors'] == '0'
 
 
-def test_images_that_the_middleware_loses_are_counted(vehicle: Vehicle) -> None:
+def test_images_that_the_middleware_loses_are_counted(vehicle) -> None:
     """A publisher with a short history sends large images faster than they can be received."""
     vehicle.start('star_observer', ros=REMAPS)
     images = vehicle.publisher(Image, IMAGES, 1)
@@ -86,7 +86,7 @@ def test_images_that_the_middleware_loses_are_counted(vehicle: Vehicle) -> None:
     assert level == b'\x01' and int(values['images_lost']) > 0
 
 
-def test_calibrator_diagnostics_match_the_document(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_calibrator_diagnostics_match_the_document(vehicle, tmp_path) -> None:
     """While collecting, with a damaged state file, and with an active calibration."""
     history = tmp_path / 'state' / 'calibrations'
     history.mkdir(parents=True)
@@ -112,7 +112,7 @@ def test_calibrator_diagnostics_match_the_document(vehicle: Vehicle, tmp_path: P
     assert math.isfinite(float(values['disk_free_mb']))
 
 
-def test_nodes_that_are_not_active(vehicle: Vehicle) -> None:
+def test_nodes_that_are_not_active(vehicle) -> None:
     for name in BOTH:
         vehicle.start(name, 'autostart:=false')
     for name in BOTH:
@@ -122,8 +122,8 @@ def test_nodes_that_are_not_active(vehicle: Vehicle) -> None:
         assert set(values) == documented()
 
 
-def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_received(
-    vehicle: Vehicle,
+def test_a_silent_topic_is_warned_of_once_and_sensor_data_are_received(
+    vehicle,
 ) -> None:
     """Best effort, as drivers offer it: all inputs connect, remapped or not."""
     node = vehicle.start('star_observer', ros=REMAPS)
@@ -145,7 +145,7 @@ def test_a_silent_topic_is_warned_of_once_and_publishers_of_sensor_data_are_rece
     vehicle.until_value('messages', '1')
 
 
-def test_a_driver_that_stops_is_named_until_it_sends_again(vehicle: Vehicle) -> None:
+def test_a_driver_that_stops_is_named_until_it_sends_again(vehicle) -> None:
     node = vehicle.start('star_observer', ros=REMAPS)
     attitudes = vehicle.publisher(QuaternionStamped, ATTITUDES, 10)
     sample = next(reader.read_raw([vehicle.bag], [ATTITUDES])).data
@@ -169,7 +169,7 @@ def test_a_driver_that_stops_is_named_until_it_sends_again(vehicle: Vehicle) -> 
     vehicle.until(is_well)
 
 
-def test_a_driver_in_another_namespace_is_named(vehicle: Vehicle) -> None:
+def test_a_driver_in_another_namespace_is_named(vehicle) -> None:
     for name in BOTH:
         vehicle.start(name)
     vehicle.node.create_publisher(Image, '/sat2/camera/image_raw', 10)
@@ -177,16 +177,15 @@ def test_a_driver_in_another_namespace_is_named(vehicle: Vehicle) -> None:
     vehicle.until(lambda: f'/image: {there}' in vehicle.health()[1])
     assert vehicle.health()[0] == b'\x01'
     answer = vehicle.call(Trigger, '/calibrator/calibrate')
-    assert answer.message.startswith(
-        f'no message on /observations: {there} and no subscriber; too'
-    )
+    words = f'no message on /observations: {there} and no subscriber; too'
+    assert answer.message.startswith(words)
     assert len(answer.message) <= 200
 
 
 IMPLAUSIBLE = 'm/s is faster than any spacecraft: left out; send m/s'
 
 
-def test_velocities_of_no_spacecraft_are_counted_and_logged_once(vehicle: Vehicle) -> None:
+def test_velocities_of_no_spacecraft_are_counted_and_logged_once(vehicle) -> None:
     """
     NaN, inf and light speed were an error a message in the log, and OK in the diagnostics.
 
@@ -222,7 +221,7 @@ def test_velocities_of_no_spacecraft_are_counted_and_logged_once(vehicle: Vehicl
     assert observer.said().count(IMPLAUSIBLE) == observer.said().count(doubt) == 1
 
 
-def test_a_publisher_that_is_not_received_is_named(vehicle: Vehicle) -> None:
+def test_a_publisher_that_is_not_received_is_named(vehicle) -> None:
     """By its name on the graph: the image was asked for as reliable, the calibration latched."""
     fixed = 'qos_overrides.{}.subscription.reliability:={}'.format
     given = fixed(IMAGES, 'reliable'), fixed('/spacecraft/velocity', 'best_effort')

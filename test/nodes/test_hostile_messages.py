@@ -3,10 +3,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 import contextlib
 import itertools
-from pathlib import Path
 import random
 import subprocess
 import sys
@@ -23,11 +22,10 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
-from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, Temperature
 from std_srvs.srv import Trigger
-from vehicle import BOTH, Client, IMAGES, NodeProcess, REMAPS, Vehicle  # type: ignore[import-not-found]
+from vehicle import BOTH, Client, IMAGES, latched_qos, NodeProcess, REMAPS, Vehicle  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
@@ -51,7 +49,6 @@ MAY_BE_INFINITE = frozenset(
     )
 )
 SHUTDOWNS = (5, 6, 7)  # a node rightly executes it
-LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class Received:
@@ -78,7 +75,6 @@ class Received:
 
 
 def batches(messages: Iterable[Any], size: int) -> Iterable[list[Any]]:
-    """Lists of at most so many messages."""
     left = iter(messages)
     return iter(lambda: list(itertools.islice(left, size)), [])
 
@@ -111,13 +107,10 @@ def assert_common_requests_are_answered(client: Client, name: str, process: Node
     given = [Parameter(name='magnitude_limit', value=value)]
     change = ChangeState.Request()
     change.transition.id = CONFIGURE
+    atomically = SetParametersAtomically
     for kind, service, request in (
         (SetParameters, 'set_parameters', SetParameters.Request(parameters=given)),
-        (
-            SetParametersAtomically,
-            'set_parameters_atomically',
-            SetParametersAtomically.Request(parameters=given),
-        ),
+        (atomically, 'set_parameters_atomically', atomically.Request(parameters=given)),
         (ChangeState, 'change_state', change),
     ):
         assert_requests_are_answered(client, kind, f'/{name}/{service}', request, process)
@@ -132,21 +125,18 @@ def small_image() -> Any:
     return image_to_message(record, 'camera', make_message)
 
 
-def compressed_image() -> Any:
-    data = cv2.imencode('.png', np.zeros((4, 4), np.uint16))[1].tobytes()
-    return CompressedImage(header=small_image().header, format='mono16; png compressed', data=data)
-
-
-@pytest.mark.parametrize(
-    ('kind', 'template'), [(Image, small_image), (CompressedImage, compressed_image)]
-)
-def test_every_image_is_answered(vehicle: Vehicle, kind: Any, template: Callable[[], Any]) -> None:
+@pytest.mark.parametrize('kind', [Image, CompressedImage])
+def test_every_image_is_answered(vehicle, kind) -> None:
+    template = small_image()
+    if kind is CompressedImage:
+        data = cv2.imencode('.png', np.zeros((4, 4), np.uint16))[1].tobytes()
+        template = kind(header=template.header, format='mono16; png compressed', data=data)
     node = vehicle.start('star_observer', 'attitude_timeout_s:=0.0', ros=REMAPS)
     answers = vehicle.collect(StarObservations, 'observations')
     infos = vehicle.collect(CameraInfo, 'image_camera_info')
     vehicle.until_listened()
     images = vehicle.publisher(kind, IMAGES)
-    for batch in batches(mutated(template(), 20), 20):  # as many as the queue holds
+    for batch in batches(mutated(template, 20), 20):  # as many as the queue holds
         before = len(answers)
         for message, _ in batch:
             images.publish(message)
@@ -154,13 +144,13 @@ def test_every_image_is_answered(vehicle: Vehicle, kind: Any, template: Callable
     assert_finite([*answers, *infos])
     # One that is cut off is counted with its reason, and the node goes on.
     counted = sum(answer.refusal == 'bad_layout' for answer in answers) + 1
-    images.publish(serialize_message(template())[:40])
+    images.publish(serialize_message(template)[:40])
     vehicle.until(lambda: answers[-1].detail.startswith(f'{IMAGES}: 40 bytes are no'))
     vehicle.until_value('refused_bad_layout', str(counted))
     assert node.process.poll() is None
 
 
-def test_the_star_observer_measures_images_after_hostile_messages(vehicle: Vehicle) -> None:
+def test_the_star_observer_measures_images_after_hostile_messages(vehicle) -> None:
     node = vehicle.start('star_observer', ros=REMAPS)
     answers = vehicle.collect(StarObservations, 'observations')
     received = Received(vehicle, 'star_observer')
@@ -172,7 +162,7 @@ def test_the_star_observer_measures_images_after_hostile_messages(vehicle: Vehic
         (Temperature, 'temperature', Temperature(header=header)),
     ):
         received.send(vehicle.publisher(kind, topic), mutated(template, 20))
-    latched = vehicle.publisher(Calibration, 'calibration', LATCHED)
+    latched = vehicle.publisher(Calibration, 'calibration', latched_qos())
     sound = calibration_to_message(calibration(), make_message)
     received.send(latched, mutated(sound, 20), at_once=1)  # a latched topic holds one message
     assert_common_requests_are_answered(vehicle, 'star_observer', node)
@@ -185,9 +175,7 @@ def test_the_star_observer_measures_images_after_hostile_messages(vehicle: Vehic
     assert node.process.poll() is None
 
 
-def test_the_calibrator_calibrates_after_hostile_messages(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_the_calibrator_calibrates_after_hostile_messages(vehicle, tmp_path) -> None:
     """Those that pass for observations are saved as well."""
     state = f'state_dir:={tmp_path}/state'
     node = vehicle.start('calibrator', 'max_images:=30', state)
@@ -219,13 +207,12 @@ def test_the_calibrator_calibrates_after_hostile_messages(
 
 @pytest.fixture
 def filled(vehicle: Vehicle) -> NodeProcess:
-    """A calibrator with the images of the tiny bag."""
     node = vehicle.start('calibrator')
     vehicle.fill(observations())
     return node
 
 
-def test_callers_at_once_and_callers_that_end(client: Client, filled: NodeProcess) -> None:
+def test_callers_at_once_and_callers_that_end(client, filled) -> None:
     callers = [client.node.create_client(Trigger, '/calibrator/calibrate') for _ in range(10)]
     client.until(lambda: all(caller.service_is_ready() for caller in callers))
     futures = [caller.call_async(Trigger.Request()) for caller in callers]
@@ -254,30 +241,28 @@ time.sleep(60)
 """
 
 
-def test_a_second_calibrator_is_warned_of(vehicle: Vehicle, filled: NodeProcess) -> None:
+def test_calls_to_a_deactivated_node_are_answered_and_a_second_calibrator_is_named(
+    vehicle, filled
+) -> None:
+    calls = [(vehicle.node.create_client(Calibrate, '/calibrator/solve'), Calibrate.Request())]
+    for name in ('calibrate', 'rollback'):
+        service = vehicle.node.create_client(Trigger, f'/calibrator/{name}')
+        calls.append((service, Trigger.Request()))
+    vehicle.until(lambda: all(service.service_is_ready() for service, _ in calls))
+    manager = Manager(vehicle, 'calibrator')
+    for transitions in ((DEACTIVATE, ACTIVATE), (DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE)):
+        futures = [service.call_async(request) for service, request in calls]
+        for transition in transitions:
+            manager.change(transition)
+        vehicle.until(lambda: all(future.done() for future in futures))  # noqa: B023
+    assert filled.process.poll() is None
+    # A second one is warned of.
     vehicle.start('calibrator', ros=('-r', '__node:=double'))
     vehicle.until(lambda: 'another node publishes' in vehicle.health('calibrator')[1])
     vehicle.calibrate()
 
 
-def test_calls_to_a_node_that_is_deactivated_are_answered(
-    client: Client, filled: NodeProcess
-) -> None:
-    calls = [(client.node.create_client(Calibrate, '/calibrator/solve'), Calibrate.Request())]
-    for name in ('calibrate', 'rollback'):
-        service = client.node.create_client(Trigger, f'/calibrator/{name}')
-        calls.append((service, Trigger.Request()))
-    client.until(lambda: all(service.service_is_ready() for service, _ in calls))
-    manager = Manager(client, 'calibrator')
-    for transitions in ((DEACTIVATE, ACTIVATE), (DEACTIVATE, CLEANUP, CONFIGURE, ACTIVATE)):
-        futures = [service.call_async(request) for service, request in calls]
-        for transition in transitions:
-            manager.change(transition)
-        client.until(lambda: all(future.done() for future in futures))  # noqa: B023
-    assert filled.process.poll() is None
-
-
-def test_kill_9_loses_no_image_that_was_saved(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_kill_9_loses_no_image_that_was_saved(vehicle, tmp_path) -> None:
     """Kills at random during images and solves, and of nodes that start."""
     choose = random.Random(2)
     with contextlib.closing(Flight(vehicle, tmp_path)) as flight:

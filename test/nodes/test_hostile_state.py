@@ -110,9 +110,7 @@ def forge(path: Path, changes: Change) -> None:
 @pytest.mark.parametrize('file', ['calibrations/00000002_*', 'ensemble/refused.json'])
 @drawn(40)
 @given(changes=CHANGES)
-def test_a_forged_file_makes_nothing_active_past_the_gate(
-    sound: Path, file: str, changes: Change
-) -> None:
+def test_a_forged_file_makes_nothing_active_past_the_gate(sound, file, changes) -> None:
     """All other files are read, and stay as they are."""
     with copied(sound) as folder:
         (path,) = folder.glob(file)
@@ -128,7 +126,7 @@ def test_a_forged_file_makes_nothing_active_past_the_gate(
 
 @drawn(20)
 @given(CHANGES)
-def test_nothing_changed_without_the_key_is_used(keyed: Path, changes: Change) -> None:
+def test_nothing_changed_without_the_key_is_used(keyed, changes) -> None:
     with copied(keyed) as folder:
         for path in folder.glob('calibrations/*.json'):
             forge(path, changes)
@@ -141,7 +139,7 @@ def test_nothing_changed_without_the_key_is_used(keyed: Path, changes: Change) -
         assert any('00000001.mcap' in t and 'HMAC is missing' in t for t in state.damage)
 
 
-def test_what_is_sealed_with_the_key_is_used(keyed: Path) -> None:
+def test_what_is_sealed_with_the_key_is_used(keyed) -> None:
     with copied(keyed) as folder:
         state = restarted(folder, keyed.with_name('key'))
         assert state.active is not None and len(state.ensemble.images) == 2
@@ -163,7 +161,7 @@ STRANGE: dict[str, tuple[str, Callable[[Path], object]]] = {
 
 
 @pytest.mark.parametrize('name', ['ensemble', 'calibrations', 'ensemble.emptied', 'other'])
-def test_nothing_behind_a_link_is_removed(name: str, sound: Path, tmp_path: Path) -> None:
+def test_nothing_behind_a_link_is_removed(name, sound, tmp_path) -> None:
     """It names the folder of another calibrator, whose files have the same names."""
     with copied(sound) as others:
         (others / 'ensemble/.00000003.mcap.0.part').touch()
@@ -180,7 +178,7 @@ def test_nothing_behind_a_link_is_removed(name: str, sound: Path, tmp_path: Path
 
 
 @pytest.mark.parametrize('name', STRANGE)
-def test_names_and_files_that_a_calibrator_never_writes(name: str, sound: Path) -> None:
+def test_names_and_files_that_a_calibrator_never_writes(name, sound) -> None:
     with copied(sound) as folder:
         before = digests(folder)
         place, make = STRANGE[name]

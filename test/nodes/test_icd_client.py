@@ -20,7 +20,7 @@ import pytest
 from rosbags import highlevel as rosbags
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import CameraInfo, Image
-from vehicle import BOTH, Vehicle  # type: ignore[import-not-found]
+from vehicle import BOTH  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration, StarObservations
 from starcal.srv import Calibrate
@@ -52,7 +52,7 @@ def bag_messages(folder: Path) -> Iterator[Any]:
             yield made
 
 
-def test_calibrates_through_the_icd(vehicle: Vehicle) -> None:
+def test_calibrates_through_the_icd(vehicle) -> None:
     """Images and attitudes give the true camera, also to late subscribers."""
     for name in BOTH:
         vehicle.start(name)
@@ -79,10 +79,8 @@ def test_calibrates_through_the_icd(vehicle: Vehicle) -> None:
         sizes = [len(one.direction_icrf), len(one.measured_px), len(one.covariance_px2)]
         assert sizes == [3 * n, 2 * n, 3 * n]
         assert len(one.magnitude) == len(one.flux_dn) == len(one.snr) == n
-        assert (
-            np.abs(np.linalg.norm(np.reshape(one.direction_icrf, (n, 3)), axis=1) - 1).max()
-            < 1e-12
-        )
+        lengths = np.linalg.norm(np.reshape(one.direction_icrf, (n, 3)), axis=1)
+        assert np.abs(lengths - 1).max() < 1e-12
 
     status = vehicle.until_images(sent)
     assert sum(status.coverage) == status.stars == sum(len(o.snr) for o in observations)
@@ -123,9 +121,8 @@ def check_products(info: Any, alignment: Any, calibration: Any, folder: Path) ->
     assert info.distortion_model == 'plumb_bob'
     assert (info.width, info.height) == (truth['width'], truth['height'])
     assert info.k[1] == 0.0
-    found = dict(
-        zip(calibration.camera.parameter_names, calibration.camera.parameters, strict=True)
-    )
+    camera = calibration.camera
+    found = dict(zip(camera.parameter_names, camera.parameters, strict=True))
     assert abs(info.k[0] - found['fx']) < 1.0
     assert abs(info.d[0] - found['k1']) < 0.01
     assert abs(info.d[2] - found['p1']) < 0.001

@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from attacks import observations  # type: ignore[import-not-found]
-from calibrators import Calibrators, kept, scripts  # type: ignore[import-not-found]
+from calibrators import kept, scripts  # type: ignore[import-not-found]
 from kept_state import activation  # type: ignore[import-not-found]
 import pytest
 
@@ -90,7 +90,7 @@ images of a reset come again to A -> 0 | none
 
 
 @pytest.mark.parametrize('name', JOINS)
-def test_nothing_is_dropped_but_by_a_reset(name: str, calibrators: Calibrators) -> None:
+def test_nothing_is_dropped_but_by_a_reset(name, calibrators) -> None:
     """It is so in memory, and after a restart from the folder alone."""
     steps, images, names = JOINS[name]
     state = calibrators.run(steps)
@@ -104,7 +104,7 @@ def test_nothing_is_dropped_but_by_a_reset(name: str, calibrators: Calibrators) 
     assert set(numbers) == set(of_name.values())  # two calibrations never have one number
 
 
-def test_another_image_of_a_stamp_is_counted(calibrators: Calibrators) -> None:
+def test_another_image_of_a_stamp_is_counted(calibrators) -> None:
     """The image of the folder stays, as the first of a stamp does, and counts of both are kept."""
     state = calibrators.run('P2 open A; P2 images 0 1; P2 close; open -; images 2')
     first = observations()[0]
@@ -119,7 +119,7 @@ def test_another_image_of_a_stamp_is_counted(calibrators: Calibrators) -> None:
     assert dict(state.ensemble.refused) == {'duplicate': 1, 'glare': 2, 'no_stars': 1}
 
 
-def test_the_limit_of_images_holds(calibrators: Calibrators) -> None:
+def test_the_limit_of_images_holds(calibrators) -> None:
     few = dataclasses.replace(calibrators.setup.calibration, max_images=4)
     calibrators.setup = dataclasses.replace(calibrators.setup, calibration=few)
     state = calibrators.run('P2 open A; P2 images 0 1 2 3; P2 close; open -; images 4 5 6; open A')
@@ -144,7 +144,7 @@ another key -> no file of .*A has an HMAC of state_key_file, but 2 are sound: gi
 
 
 @pytest.mark.parametrize('name', UNJOINED)
-def test_what_cannot_be_joined_stops_the_transition(name: str, calibrators: Calibrators) -> None:
+def test_what_cannot_be_joined_stops_the_transition(name, calibrators) -> None:
     """One sentence with the remedy; memory and folder are as before."""
     steps, words = UNJOINED[name]
     before, _, last = steps.rpartition('; ')
@@ -158,7 +158,7 @@ def test_what_cannot_be_joined_stops_the_transition(name: str, calibrators: Cali
     assert kept(state) == ('0 1', 'm')
 
 
-def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators: Calibrators) -> None:
+def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators) -> None:
     """Its records stay in its folder, and are not mixed with those of the other."""
     state = calibrators.run('open A; images 0 1; activate a; camera navcam_2; open B')
     assert str(state).endswith(f'they stay in {calibrators.disk / "A"}')
@@ -167,9 +167,7 @@ def test_a_camera_that_is_on_disk_makes_place_for_another(calibrators: Calibrato
     assert kept(state) == ('0 1', 'a')
 
 
-def test_a_disk_that_fails_at_any_write_of_a_join(
-    calibrators: Calibrators, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_fails_at_any_write_of_a_join(calibrators, monkeypatch) -> None:
     """Nothing of the folder is lost, and the later activation of those on disk is active."""
     calibrators.run('open A; images 0 1; activate a; kill')
     for writes in itertools.count():

@@ -4,11 +4,8 @@
 from __future__ import annotations
 
 import ctypes
-from pathlib import Path
 import random
 import signal
-import subprocess
-import sys
 import threading
 import time
 from typing import Any
@@ -17,8 +14,9 @@ from lifecycle_msgs.msg import Transition
 from managers import ACTIVATE, CLEANUP, CONFIGURE, DEACTIVATE, Manager, NO_TRANSITION  # type: ignore[import-not-found]
 import pytest
 import rclpy
+from starcal_tool import run_python  # type: ignore[import-not-found]
 from std_msgs.msg import Empty
-from vehicle import BOTH, Client, parameters, Vehicle  # type: ignore[import-not-found]
+from vehicle import BOTH, parameters  # type: ignore[import-not-found]
 
 from starcal_ros.ros.calibrator import Calibrator
 from starcal_ros.ros.node import Executor
@@ -60,7 +58,7 @@ def try_everything(manager: Manager, state: str) -> None:
 
 @pytest.mark.parametrize('shut_down', [False, True])
 @pytest.mark.parametrize('state', PATHS)
-def test_every_transition_in_every_state(vehicle: Vehicle, state: str, shut_down: bool) -> None:
+def test_every_transition_in_every_state(vehicle, state, shut_down) -> None:
     """Each node survives all transitions, and a signal ends it with status 0 in every state."""
     # An interpreter of its own ends with all threads and publishers where the node was active.
     nodes = [vehicle.start(name, 'autostart:=false', forked=state != 'active') for name in BOTH]
@@ -83,8 +81,7 @@ def test_every_transition_in_every_state(vehicle: Vehicle, state: str, shut_down
 
 def run(code: str, *arguments: str) -> tuple[int, str, str]:
     """Exit status and output of a process that runs some lines."""
-    command = [sys.executable, '-c', code, *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_python('-c', code, *arguments)
     return done.returncode, done.stdout, done.stderr
 
 
@@ -185,7 +182,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize('name', ENDS)
-def test_a_node_ends_by_signals_and_errors(name: str) -> None:
+def test_a_node_ends_by_signals_and_errors(name) -> None:
     code, argument, expected = ENDS[name]
     assert run(OF_A_NODE + code, argument) == expected
 
@@ -236,7 +233,7 @@ node.main(sys.argv[1:])
 
 
 @pytest.mark.parametrize('name', ['calibrator', 'bag_player'])
-def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_bag: Path) -> None:
+def test_an_executor_outlives_the_thread_that_answers_signals(name, tiny_bag) -> None:
     """The thread triggers a condition of each executor, and may find it half destroyed."""
     parameters = ['-p', f'bag:={tiny_bag}'] if name == 'bag_player' else ['-p', 'autostart:=false']
     status, out, error = run(EXECUTOR_OF_A_NODE, name, '--ros-args', *parameters)
@@ -245,7 +242,7 @@ def test_an_executor_outlives_the_thread_that_answers_signals(name: str, tiny_ba
     assert lines.index('executor destroyed') > lines.index('signals answered no more')
 
 
-def test_no_event_ends_a_wait_while_a_message_waits_for_a_thread(client: Client) -> None:
+def test_no_event_ends_a_wait_while_a_message_waits_for_a_thread(client) -> None:
     """The middleware shows events of a subscription as ready until its message is taken."""
     context = client.node.context
     executor, node = Executor(2, context=context), rclpy.create_node('waits', context=context)
@@ -276,7 +273,7 @@ def test_no_event_ends_a_wait_while_a_message_waits_for_a_thread(client: Client)
         node.destroy_node()
 
 
-def test_an_error_while_a_message_is_taken_frees_its_group(client: Client) -> None:
+def test_an_error_while_a_message_is_taken_frees_its_group(client) -> None:
     """As where a subscription is destroyed meanwhile: others of the group are called again."""
     context = client.node.context
     executor, node = Executor(2, context=context), rclpy.create_node('fails', context=context)
@@ -330,7 +327,7 @@ def test_threads_share_one_arena_of_memory() -> None:
 
 
 @pytest.mark.parametrize('seed', range(2))
-def test_nodes_end_after_several_signals(vehicle: Vehicle, seed: int) -> None:
+def test_nodes_end_after_several_signals(vehicle, seed) -> None:
     """`ros2 launch` sends SIGINT to a node whose process group may have had one already."""
     rng = random.Random(seed)
     nodes = [vehicle.start(name, forked=False) for name in BOTH]
@@ -376,14 +373,14 @@ sys.exit(run(Slow, 'calibrator', sys.argv[1:]))
 """
 
 
-def test_a_callback_that_runs_at_the_end_has_a_node(tiny_bag: Path) -> None:
+def test_a_callback_that_runs_at_the_end_has_a_node(tiny_bag) -> None:
     """In a destroyed one, rclpy crashes where the state is asked for."""
     status, out, error = run(CALLBACK_AT_THE_END, '--ros-args', *parameters(tiny_bag))
     assert status == 0, error
     assert out.startswith('a node ')
 
 
-def test_a_destroyed_node_is_no_longer_in_the_graph(client: Client, tiny_bag: Path) -> None:
+def test_a_destroyed_node_is_no_longer_in_the_graph(client, tiny_bag) -> None:
     """A process may hold several nodes, one after the other, with the same name."""
     rclpy.init(args=['--ros-args', *parameters(tiny_bag)])
     try:

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from rclpy.serialization import deserialize_message, serialize_message
 from sample_records import assert_same, calibration, observations, status  # type: ignore[import-not-found]
-from vehicle import Client  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import image_to_message
 from starcal_ground.ros.bag_player import BagPlayer
@@ -38,7 +37,6 @@ pytestmark = pytest.mark.nodes
 
 
 def through_wire(message: Any) -> Any:
-    """Return the message after serialisation and back."""
     return deserialize_message(serialize_message(message), type(message))
 
 
@@ -92,9 +90,7 @@ def test_unknown_types_are_import_errors() -> None:
             message_class(name)
 
 
-def test_a_line_that_logs_without_end_fills_no_disk(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_line_that_logs_without_end_fills_no_disk(capfd, monkeypatch) -> None:
     """Ten images a second are refused for ten minutes; another line logs as ever."""
     now_s = 0.0
     monkeypatch.setattr('starcal_ros.ros.printable_log.time.monotonic', lambda: now_s)
@@ -111,9 +107,7 @@ def test_a_line_that_logs_without_end_fills_no_disk(
     assert said[-1] == 'stamps went back'
 
 
-def test_escape_sequences_do_not_reach_the_terminal(
-    client: Client, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_escape_sequences_do_not_reach_the_terminal(client, capfd) -> None:
     """At each severity, from lines of their own."""
     assert issubclass(StarcalNode, PrintableLog) and issubclass(BagPlayer, PrintableLog)
     node = PrintableLog('quoting', context=client._context)

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 import dataclasses
 import functools
 import importlib.util
@@ -19,7 +18,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, Imu, Temperature
 from std_srvs.srv import Trigger
 from vehicle import (  # type: ignore[import-not-found]
@@ -27,11 +26,10 @@ from vehicle import (  # type: ignore[import-not-found]
     BOTH,
     Client,
     IMAGES,
+    latched_qos,
     parameters,
     REMAPS,
-    StartNode,
     tiny_observations,
-    Vehicle,
 )
 
 from starcal.msg import Calibration, EnsembleStatus, StarObservations
@@ -75,11 +73,10 @@ def blank(stamp_ns: int, **change: Any) -> Any:
 
 
 def attitude(stamp_ns: int) -> Any:
-    """Return an attitude message."""
     return attitude_to_message(stamp_ns, np.array([0, 0, 0, 1.0]), '', make_message)
 
 
-def test_nodes_and_tool_give_the_same_calibration(vehicle: Vehicle, tiny_products: Path) -> None:
+def test_nodes_and_tool_give_the_same_calibration(vehicle, tiny) -> None:
     """The observations have rates and the sigma of the velocity, the picture the image's size."""
     for name in BOTH:
         vehicle.start(name, ros=REMAPS)
@@ -102,28 +99,25 @@ def test_nodes_and_tool_give_the_same_calibration(vehicle: Vehicle, tiny_product
     vehicle.calibrate()
     found = vehicle.until_latched(Calibration, 'calibration')
     live = calibration_from_message(found[0])
-    offline = read_calibration(tiny_products / CALIBRATION_FILE)
     # On a busy machine the velocity after an image may come too late: the one before it, of half a
     # second earlier, moves the stars by 1e-8 px.
-    sigma = np.sqrt(np.diag(offline.covariance))
-    off = live.geometry.camera.parameters - offline.geometry.camera.parameters
+    sigma = np.sqrt(np.diag(tiny.covariance))
+    off = live.geometry.camera.parameters - tiny.geometry.camera.parameters
     assert np.abs(off / sigma[:10]).max() < 1e-5
-    turn = live.geometry.star_tracker_from_camera.inv() * offline.geometry.star_tracker_from_camera
+    turn = live.geometry.star_tracker_from_camera.inv() * tiny.geometry.star_tracker_from_camera
     assert (np.abs(turn.as_rotvec()) < 1e-5 * sigma[10:]).all()
-    off = (live.covariance - offline.covariance) / np.outer(sigma, sigma)
+    off = (live.covariance - tiny.covariance) / np.outer(sigma, sigma)
     assert np.abs(off).max() < 1e-5
-    assert live.residual_rms_px == pytest.approx(offline.residual_rms_px, rel=1e-6)
-    assert (live.stars_used, live.stars_rejected) == (offline.stars_used, offline.stars_rejected)
-    assert live.images_refused == offline.images_refused
+    assert live.residual_rms_px == pytest.approx(tiny.residual_rms_px, rel=1e-6)
+    assert (live.stars_used, live.stars_rejected) == (tiny.stars_used, tiny.stars_rejected)
+    assert live.images_refused == tiny.images_refused
     # The digest of the observations has that velocity in it.
-    ours = {k: v for k, v in offline.provenance.items() if not k.startswith('input ')}
+    ours = {k: v for k, v in tiny.provenance.items() if not k.startswith('input ')}
     digest = 'observations_sha256'
     assert dict(live.provenance) == ours | {digest: live.provenance[digest]}
 
 
-def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_after_a_second_request_images_of_a_wrong_set_up_are_used(vehicle, tmp_path) -> None:
     """The observer measures the images that matched no star again with the first calibration."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
     wrong = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
@@ -147,7 +141,7 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used_as_by_the_tool
     np.testing.assert_allclose(live.sigma, offline.sigma, rtol=1e-4)
 
 
-def test_each_service_of_a_calibrator(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_each_service_of_a_calibrator(vehicle, tmp_path) -> None:
     """Dry runs, bad requests, a table, roll-back, reset: one calibration is ever published."""
     vehicle.start('calibrator')
     # A call that changes nothing: if its answer is lost, it is called again.
@@ -204,7 +198,7 @@ def test_each_service_of_a_calibrator(vehicle: Vehicle, tmp_path: Path) -> None:
     assert not none.success and 'no calibration before' in none.message
 
 
-def test_gate_refusal_and_force(vehicle: Vehicle) -> None:
+def test_gate_refusal_and_force(vehicle) -> None:
     """A refused candidate is only in the response, unless it is forced."""
     calibrator = vehicle.start_filled('max_change_px:=1e-6')
     found = vehicle.until_latched(Calibration, 'calibration')
@@ -226,7 +220,7 @@ def test_gate_refusal_and_force(vehicle: Vehicle) -> None:
     assert calibrator.process.poll() is None
 
 
-def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle: Vehicle) -> None:
+def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle) -> None:
     """The attitudes are those of an Imu, which the node takes by the type of their publisher."""
     ros = (*REMAPS, '-r', 'temperature:=/box')
     vehicle.start('star_observer', 'attitude_timeout_s:=60.0', ros=ros)
@@ -256,7 +250,7 @@ def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle: Vehicl
     assert answers[0].temperature_degc == -7.25
 
 
-def test_overrun_is_answered(vehicle: Vehicle) -> None:
+def test_overrun_is_answered(vehicle) -> None:
     """With more images than the queue holds, each is answered, the surplus with overrun."""
     vehicle.start('star_observer', 'attitude_timeout_s:=60.0')
     answers: list[Any] = vehicle.collect(StarObservations, 'observations')
@@ -273,19 +267,17 @@ def test_overrun_is_answered(vehicle: Vehicle) -> None:
     assert [a.refusal for a in answers] == ['wrong_size'] * 20 + ['overrun'] * 20
 
 
-def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
+def test_camera_info_per_image(vehicle, tiny) -> None:
     """The active calibration with the header of each image; never the prior or a candidate."""
-    active = read_calibration(tiny_products / CALIBRATION_FILE)
-    candidate = dataclasses.replace(active, accepted=False, reasons=('bad',))
+    candidate = dataclasses.replace(tiny, accepted=False, reasons=('bad',))
     observer = vehicle.start('star_observer', 'attitude_timeout_s:=0.0')
     best_effort = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
     lossy = vehicle.collect(CameraInfo, 'image_camera_info', best_effort)
     infos: list[Any] = vehicle.collect(CameraInfo, 'image_camera_info')
     answers: list[Any] = vehicle.collect(StarObservations, 'observations')
     images = vehicle.publisher(Image, 'image', 50)
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    calibrations = vehicle.node.create_publisher(Calibration, 'calibration', latched)
-    camera = active.geometry.camera
+    calibrations = vehicle.node.create_publisher(Calibration, 'calibration', latched_qos())
+    camera = tiny.geometry.camera
     vehicle.until_listened()
 
     def show(stamp_ns: int, frame_id: str = 'opnav', **size: int) -> Any:
@@ -302,12 +294,12 @@ def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
     publish(candidate, 'calibration: refused by the gate')
     show(2)
     vehicle.until(lambda: len(answers) == 2)
-    publish(active, 'predicting stars with the active calibration')
+    publish(tiny, 'predicting stars with the active calibration')
     headers = [show(3), show(4, width=8, height=8), show(7), show(5, 'other')]
     vehicle.until(lambda: len(answers) == 6 and len(infos) == 3)
     # Nothing of the first two comes later: what is of one publisher comes in order.
     assert [info.header for info in infos] == [headers[0], *headers[2:]]
-    expected = camera_info_to_message(active, make_message)
+    expected = camera_info_to_message(tiny, make_message)
     for info in infos:
         expected.header = info.header
         assert info == expected
@@ -322,7 +314,7 @@ def test_camera_info_per_image(vehicle: Vehicle, tiny_products: Path) -> None:
     assert lossy[0].k[0] > 0
 
 
-def test_calibrator_collects_while_it_solves(vehicle: Vehicle) -> None:
+def test_calibrator_collects_while_it_solves(vehicle) -> None:
     """Observations that arrive during a calibration are all counted, bad ones are logged."""
     calibrator = vehicle.start_filled()
     observations = vehicle.publisher(StarObservations, 'observations')
@@ -344,12 +336,6 @@ def test_calibrator_collects_while_it_solves(vehicle: Vehicle) -> None:
     assert 'Traceback' not in calibrator.said()
 
 
-def broken_file(_: Path, scratch: Path) -> tuple[str, ...]:
-    """ROS arguments for a parameter file that is no YAML."""
-    (scratch / 'params.yaml').write_text('/**:\n  ros__parameters: {psf: {a: [1, b')
-    return ('--params-file', str(scratch / 'params.yaml'))
-
-
 OBSERVER, CALIBRATOR = BOTH
 
 
@@ -365,7 +351,7 @@ OBSERVER, CALIBRATOR = BOTH
         ),
         (CALIBRATOR, lambda *_: ('-p', 'magnitude_limit:=6.0'), 'camera_info_url'),
         (OBSERVER, lambda *_: ('--params-file', '/no/such/params.yaml'), '/no/such/params.yaml'),
-        (CALIBRATOR, broken_file, 'params.yaml'),
+        (CALIBRATOR, lambda _, scratch: ('--params-file', str(scratch / 'a.yaml')), 'a.yaml'),
         ('bag_player', lambda *_: (), 'bag: path of the bag to play is missing'),
         ('bag_player', lambda f, _: parameters(f, 'bag:=/no/bag'), '/no/bag: no such file or fol'),
         ('bag_player', lambda *_: ('-p', 'bag:=x', '-p', 'rate:=-1.0'), 'rate'),
@@ -376,22 +362,16 @@ OBSERVER, CALIBRATOR = BOTH
         ),
     ],
 )
-def test_bad_parameters(
-    start_node: StartNode,
-    tiny_bag: Path,
-    tmp_path: Path,
-    name: str,
-    arguments: Callable[[Path, Path], tuple[str, ...]],
-    text: str,
-) -> None:
+def test_bad_parameters(start_node, tiny_bag, tmp_path, name, arguments, text) -> None:
     """A bad parameter ends a node with status 2 and one line that names it."""
+    (tmp_path / 'a.yaml').write_text('/**:\n  ros__parameters: {psf: {a: [1, b')
     node = start_node(name, *arguments(tiny_bag, tmp_path))
     assert node.wait() == 2
     (line,) = (line for line in node.said().splitlines() if line.startswith(f'{name}: '))
     assert text in line and 'Traceback' not in node.said()
 
 
-def test_parameters_while_running(vehicle: Vehicle) -> None:
+def test_parameters_while_running(vehicle) -> None:
     """Parameters have descriptions, and those in use cannot be changed."""
     node = vehicle.start('star_observer', 'max_attitude_gap_s:=3')
     described = vehicle.call(
@@ -429,7 +409,7 @@ def set_gap(
     return '' if answer.results[0].successful else str(answer.results[0].reason)
 
 
-def test_player_loses_nothing(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_player_loses_nothing(vehicle, tmp_path) -> None:
     """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
     with BagWriter(tmp_path / 'large') as writer:
@@ -457,7 +437,7 @@ def test_player_loses_nothing(vehicle: Vehicle, tmp_path: Path) -> None:
 ROOT = Path(__file__).parents[2]
 
 
-def test_a_bag_plays_again_by_its_clock(vehicle: Vehicle) -> None:
+def test_a_bag_plays_again_by_its_clock(vehicle) -> None:
     """Nodes as in replay.launch.py, with a namespace and /clock; a second pass adds nothing."""
     for name in BOTH:
         ros = ('-r', '__ns:=/cam', '-r', f'__node:={name}', *REMAPS, '--log-level', 'info')
@@ -466,7 +446,12 @@ def test_a_bag_plays_again_by_its_clock(vehicle: Vehicle) -> None:
     status = vehicle.latched(EnsembleStatus, '/cam/ensemble_status')
     health = vehicle.collect(DiagnosticArray, '/diagnostics')
     # Simulated time without a /clock yet: diagnostics come all the same, and warn of it.
-    vehicle.until(lambda: len({one.status[0].name for one in health if warns_of_clock(one)}) == 2)
+
+    def warned() -> set[str]:
+        told = [one.status[0] for one in health if one.status[0].level == b'\x01']
+        return {one.name for one in told if one.message.startswith('no /clock: ')}
+
+    vehicle.until(lambda: len(warned()) == 2)
     vehicle.start_player(vehicle.bag, 'loop:=true', 'clock:=true', ros=('-r', '__ns:=/cam'))
 
     def restarts() -> int:
@@ -485,12 +470,7 @@ def test_a_bag_plays_again_by_its_clock(vehicle: Vehicle) -> None:
     vehicle.until(is_within_the_bag)  # whatever pass: the diagnostics take the time from /clock
 
 
-def warns_of_clock(message: DiagnosticArray) -> bool:
-    status = message.status[0]
-    return bool(status.level == b'\x01' and status.message.startswith('no /clock: '))
-
-
-def test_the_policies_name_what_the_nodes_have(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_the_policies_name_what_the_nodes_have(vehicle, tmp_path) -> None:
     """Each security policy allows exactly the topics and services of its node."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_image('/image', ImageRecord(1, np.zeros((2, 2), np.uint8)), 'camera')
@@ -543,5 +523,4 @@ def of_graph(client: Client, name: str) -> set[tuple[str, str]]:
 
 
 def shows(client: Client, name: str, allowed: set[tuple[str, str]]) -> bool:
-    """Return True once the graph shows all names that a node may use."""
     return name in client.node.get_node_names() and of_graph(client, name) >= allowed

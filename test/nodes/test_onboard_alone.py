@@ -11,13 +11,12 @@ from collections.abc import Iterator
 from importlib import metadata
 import json
 from pathlib import Path
-import subprocess
-import sys
 
 from ament_index_python.packages import get_packages_with_prefixes
 from packaging.requirements import Requirement
 import pytest
-from vehicle import BOTH, REMAPS, Vehicle  # type: ignore[import-not-found]
+from starcal_tool import run_python  # type: ignore[import-not-found]
+from vehicle import BOTH, REMAPS  # type: ignore[import-not-found]
 
 from starcal.msg import Calibration
 import starcal_ros
@@ -89,19 +88,13 @@ def onboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv('PYTHONPATH', f'{tmp_path}:{ROOT}')
 
 
-def run(*words: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *map(str, words)], capture_output=True, text=True, check=False
-    )
-
-
 def test_what_stays_on_the_ground_cannot_be_imported() -> None:
-    done = run('-c', IMPORTED, *ON_THE_GROUND)
+    done = run_python('-c', IMPORTED, *ON_THE_GROUND)
     assert (done.returncode, done.stdout.split()) == (0, [*ON_THE_GROUND])
 
 
 def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
-    vehicle: Vehicle, few_images: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    vehicle, few_images, tmp_path, monkeypatch
 ) -> None:
     """Of the messages of a player on the ground, with a state folder."""
     vehicle.bag = few_images
@@ -116,7 +109,7 @@ def test_nodes_calibrate_and_a_consumer_reads_the_calibration(
     vehicle.until_images(3, 'images_saved')
     vehicle.calibrate()
     published = vehicle.until_latched(Calibration, 'calibration')
-    done = run('-c', READ, tmp_path / 'kept')
+    done = run_python('-c', READ, tmp_path / 'kept')
     assert (done.returncode, done.stderr) == (0, '')
     is_accepted, images, sight = json.loads(done.stdout)
     assert is_accepted and published[0].accepted

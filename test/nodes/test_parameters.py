@@ -7,7 +7,6 @@ from pathlib import Path
 
 import pytest
 from rcl_interfaces.srv import GetParameters
-from vehicle import Vehicle  # type: ignore[import-not-found]
 
 from starcal_ros.ros.parameters import folders_of_paths, unread_sections
 
@@ -20,9 +19,7 @@ ROOT = Path(__file__).parents[2]
     ('section', 'reaches'),
     [('/opnav/calibrator', True), ('calibrator', False)],
 )
-def test_a_section_in_a_namespace(
-    vehicle: Vehicle, tmp_path: Path, section: str, reaches: bool
-) -> None:
+def test_a_section_in_a_namespace(vehicle, tmp_path, section, reaches) -> None:
     """What rcl does with it, and that the node warns of what rcl passes over."""
     params = tmp_path / 'params.yaml'
     params.write_text(f'{section}:\n  ros__parameters: {{min_images: 7}}\n')
@@ -35,9 +32,7 @@ def test_a_section_in_a_namespace(
 
 
 @pytest.mark.parametrize('file', ['config/minimal.yaml', 'bags/tiny/params.yaml'])
-def test_a_node_starts_with_a_file_of_the_repository_from_any_folder(
-    vehicle: Vehicle, file: str
-) -> None:
+def test_a_node_starts_with_a_file_of_the_repository_from_any_folder(vehicle, file) -> None:
     """The camera file of the small bag is relative to its parameters, not to this folder."""
     params = ROOT / file
     camera = f'camera_info_url:=file://{vehicle.bag}/camera.yaml'
@@ -48,17 +43,14 @@ def test_a_node_starts_with_a_file_of_the_repository_from_any_folder(
     vehicle.until(lambda: 'active, listening to' in node.said())
 
 
-def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path: Path) -> None:
+def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path) -> None:
     values = '{camera_info_url: camera.yaml, catalog: /a.npz, dark_frame: "", state_dir: here}'
     params = tmp_path / 'params.yaml'
     params.write_text(f'/**:\n  ros__parameters: {values}\n')
     other = tmp_path / 'other.yaml'
     other.write_text('/**/star_observer:\n  ros__parameters: {flat_field: flat.png}\n')
     given = ['--ros-args', '--params-file', str(params), '--params-file', str(other)]
-    camera = {
-        ('camera_info_url', 'camera.yaml'): tmp_path,
-        ('state_dir', 'here'): tmp_path,
-    }
+    camera = dict.fromkeys([('camera_info_url', 'camera.yaml'), ('state_dir', 'here')], tmp_path)
     assert folders_of_paths(given, '/calibrator') == camera
     flat = {('flat_field', 'flat.png'): tmp_path}
     assert folders_of_paths(given, '/star_observer') == camera | flat
@@ -66,7 +58,7 @@ def test_a_path_is_relative_to_the_file_that_gives_it(tmp_path: Path) -> None:
     assert folders_of_paths(['--params-file', str(of_launch)], '/calibrator') == {}
 
 
-def test_sections_of_others_are_no_concern(tmp_path: Path) -> None:
+def test_sections_of_others_are_no_concern(tmp_path) -> None:
     """Two cameras in one file, other packages in it, and a name that is misspelt."""
     params = tmp_path / 'params.yaml'
     sections = ('/west/calibrator', '/east/calibrator', 'star_observer', 'camera_calibrator')

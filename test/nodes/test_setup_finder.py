@@ -9,7 +9,7 @@ from geometry_msgs.msg import QuaternionStamped
 import numpy as np
 import pytest
 from sensor_msgs.msg import Image
-from vehicle import ATTITUDES, Client, IMAGES, REMAPS, Vehicle  # type: ignore[import-not-found]
+from vehicle import ATTITUDES, Client, IMAGES, REMAPS  # type: ignore[import-not-found]
 import yaml
 
 from starcal.msg import SetupDiagnosis
@@ -32,7 +32,7 @@ def play(client: Client, bag: Path, nodes: int = 2) -> None:
         images.publish(image.data)
 
 
-def test_five_images_without_a_match_are_diagnosed_until_images_match(vehicle: Vehicle) -> None:
+def test_five_images_without_a_match_are_diagnosed_until_images_match(vehicle) -> None:
     wrong = 'attitude_direction:=inertial_to_st'
     names = ('setup_finder', 'star_observer')
     _, observer = (vehicle.start(name, wrong, ros=REMAPS) for name in names)
@@ -57,7 +57,7 @@ def test_five_images_without_a_match_are_diagnosed_until_images_match(vehicle: V
     assert 'Traceback' not in again.said()
 
 
-def test_an_alignment_not_given_is_found(vehicle: Vehicle) -> None:
+def test_an_alignment_not_given_is_found(vehicle) -> None:
     """The star observer does not start without one, and names the two ways to find it."""
     observer = vehicle.start('star_observer', ZEROS, ros=REMAPS)
     assert observer.wait() == 2

@@ -18,7 +18,7 @@ from mission_files import attitudes, images  # type: ignore[import-not-found]
 import pytest
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Image
-from vehicle import Client, in_this_process, Vehicle  # type: ignore[import-not-found]
+from vehicle import in_this_process  # type: ignore[import-not-found]
 import yaml
 
 from starcal.msg import Calibration, StarObservations
@@ -28,7 +28,6 @@ from starcal_ros.formats.messages.record_messages import (
     calibration_from_message,
     calibration_to_message,
 )
-from starcal_ros.formats.products.product_files import CALIBRATION_FILE, read_calibration
 from starcal_ros.records import Image as ImageRecord
 from starcal_ros.ros.node import make_message
 from starcal_ros.ros.star_observer import StarObserver
@@ -38,14 +37,11 @@ pytestmark = pytest.mark.nodes
 
 @pytest.fixture
 def observer(ros_domain: None, tiny_bag: Path) -> Iterator[StarObserver]:
-    """An active star observer in this process."""
     with in_this_process(StarObserver, tiny_bag) as node:
         yield node
 
 
-def test_the_worker_alone_changes_prediction_and_counts(
-    observer: StarObserver, tiny_products: Path
-) -> None:
+def test_the_worker_alone_changes_prediction_and_counts(observer, tiny) -> None:
     """A calibration that arrives while the worker measures waits for it."""
     busy, go_on, done = threading.Event(), threading.Event(), threading.Event()
 
@@ -55,8 +51,7 @@ def test_the_worker_alone_changes_prediction_and_counts(
 
     observer._queue.call(hold)
     assert busy.wait(240.0)
-    active = read_calibration(tiny_products / CALIBRATION_FILE)
-    observer._on_calibration(calibration_to_message(active, make_message))
+    observer._on_calibration(calibration_to_message(tiny, make_message))
     prior = observer._setup.prior
     assert observer._geometry is prior
     observer._queue.call(done.set)
@@ -66,17 +61,13 @@ def test_the_worker_alone_changes_prediction_and_counts(
 
 
 @pytest.mark.parametrize('changed', [{'child_frame': 'other'}, {'parent_frame': 'other'}])
-def test_a_calibration_of_other_frames_is_not_used(
-    observer: StarObserver, tiny_products: Path, changed: Any
-) -> None:
-    other = replace(read_calibration(tiny_products / CALIBRATION_FILE), **changed)
+def test_a_calibration_of_other_frames_is_not_used(observer, tiny, changed) -> None:
+    other = replace(tiny, **changed)
     with pytest.raises(ValueError, match="'other'.*, not .'camera', 'star_tracker'"):
         observer._on_calibration(calibration_to_message(other, make_message))
 
 
-def test_the_first_image_awaits_a_velocity_that_has_a_publisher(
-    observer: StarObserver, client: Client
-) -> None:
+def test_the_first_image_awaits_a_velocity_that_has_a_publisher(observer, client) -> None:
     assert observer._is_told()
     client.publisher(TwistStamped, observer.resolve_topic_name('velocity'))
     client.until(lambda: not observer._is_told())
@@ -113,7 +104,7 @@ def attitude_messages(mounted: Rotation, from_ns: int, to_ns: int) -> list[Any]:
     ]
 
 
-def test_one_takes_over_from_another(vehicle: Vehicle, tmp_path: Path) -> None:
+def test_one_takes_over_from_another(vehicle, tmp_path) -> None:
     """Every image is used, and the calibration has the alignment to each star tracker."""
     params = parameter_file(vehicle.bag, tmp_path / 'params.yaml')
     bag, samples, shown = tmp_path / 'two', attitudes(), images()[4:]
@@ -139,9 +130,7 @@ def test_one_takes_over_from_another(vehicle: Vehicle, tmp_path: Path) -> None:
     assert 0 < first.images <= len(shown) - 3
 
 
-def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(vehicle, tmp_path) -> None:
     """The first star tracker is right and comes later, the other is 5 degrees off."""
     params = parameter_file(vehicle.bag, tmp_path / 'params.yaml', wrong_by_deg=5.0)
     patient = ('--params-file', str(params), '-p', 'attitude_timeout_s:=60.0')
@@ -179,9 +168,7 @@ def test_a_slow_one_is_used_and_a_wrong_one_costs_no_image(
     assert vehicle.health()[:2] == (b'\x01', found[1].detail)
 
 
-def test_the_first_images_wait_for_a_late_one_beside_a_wrong_one(
-    vehicle: Vehicle, tmp_path: Path
-) -> None:
+def test_the_first_images_wait_for_a_late_one_beside_a_wrong_one(vehicle, tmp_path) -> None:
     """No delay is known yet: images are refused by the wrong one, then used by the late one."""
     params = parameter_file(vehicle.bag, tmp_path / 'params.yaml', wrong_by_deg=40.0)
     vehicle.start_node('star_observer', '--params-file', str(params))

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-import subprocess
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 from bench import acquisition
 from starcal_ros.errors import ImageRefused
@@ -26,8 +25,7 @@ ROOT = Path(__file__).parents[2]
 def found_by(name: str, tmp_path: Path) -> tuple[Any, str]:
     """Tables of a bench in its short form, and what it prints."""
     found = tmp_path / 'found.json'
-    command = [sys.executable, '-m', 'bench', name, '--quick', '--json', str(found)]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    done = run_python('-m', 'bench', name, '--quick', '--json', found, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return json.loads(found.read_text())[name], done.stdout
 

@@ -13,19 +13,13 @@ import sys
 
 from managers import Manager  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
-BUILT = (
-    'CMakeLists.txt',
-    'package.xml',
-    'setup.cfg',
-    'msg',
-    'srv',
-    'starcal_ros',
-    'starcal_ground',
-)
+BUILT = ('CMakeLists.txt', 'package.xml', 'setup.cfg', 'msg', 'srv')
 TESTED = ('bench', 'docs', 'pyproject.toml', 'studies', 'test', 'tools', 'README.md', 'LICENSE')
 INSTALLED = ('launch', 'config', 'bags/tiny')
+PACKAGES = ('starcal_ros', 'starcal_ground')
 NODE_STOPS_WITHIN_S = 240.0
 
 pytestmark = [pytest.mark.packaging, pytest.mark.slow]
@@ -64,7 +58,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workspace = tmp_path_factory.mktemp('workspace')
     package = workspace / 'src' / 'starcal'
     package.mkdir(parents=True)
-    for name in filter(lambda name: (ROOT / name).exists(), BUILT + INSTALLED + TESTED):
+    for name in filter(lambda name: (ROOT / name).exists(), BUILT + PACKAGES + INSTALLED + TESTED):
         if (ROOT / name).is_dir():
             ignore = shutil.ignore_patterns('__pycache__')
             shutil.copytree(ROOT / name, package / name, ignore=ignore)
@@ -83,16 +77,12 @@ def workspace(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def colcon(workspace: Path, *arguments: str, **more: str) -> subprocess.CompletedProcess[str]:
-    """Run colcon in the workspace, on the environment as underlay."""
     underlay = {'AMENT_PREFIX_PATH': sys.prefix, 'CMAKE_PREFIX_PATH': sys.prefix}
-    return subprocess.run(
-        [sys.executable, '-m', 'colcon', *arguments],
-        cwd=workspace,
-        env=os.environ | underlay | {'COLCON_HOME': str(workspace)} | more,
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
+    env = os.environ | underlay | {'COLCON_HOME': str(workspace)} | more
+    made: subprocess.CompletedProcess[str] = run_python(
+        '-m', 'colcon', *arguments, cwd=workspace, env=env, stdin=subprocess.DEVNULL
     )
+    return made
 
 
 def in_workspace(workspace: Path, *command: str | Path) -> list[str]:
@@ -103,7 +93,7 @@ def in_workspace(workspace: Path, *command: str | Path) -> list[str]:
 
 def test_imports_come_from_the_install_space(workspace) -> None:
     command = in_workspace(workspace, sys.executable, '-c', ORIGINS)
-    shown = subprocess.run(command, capture_output=True, text=True, cwd=workspace)
+    shown = run(*command, cwd=workspace)
     assert shown.returncode == 0, shown.stderr
     origins = shown.stdout.split()
     assert len(origins) > 3  # the two packages and the libraries of the messages

@@ -17,11 +17,11 @@ import json
 from pathlib import Path
 import re
 import shutil
-import subprocess
 from typing import Any
 
 import pytest
 from rosbags.typesys import get_types_from_msg, get_typestore, Stores
+from starcal_tool import run  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.player_options import PlayerOptions
@@ -44,13 +44,11 @@ def tool(name: str) -> Any:
     return module
 
 
-def test_parameter_file_is_up_to_date() -> None:
-    """The file equals the output of tools/write_parameters.py."""
-    assert (CONFIG / 'starcal.yaml').read_text() == tool('write_parameters').parameter_file()
-
-
-def test_every_parameter_stands_with_its_default() -> None:
-    content = yaml.safe_load((CONFIG / 'starcal.yaml').read_text())
+def test_the_parameter_file_is_up_to_date_and_has_the_defaults() -> None:
+    """It equals the output of tools/write_parameters.py."""
+    text = (CONFIG / 'starcal.yaml').read_text()
+    assert text == tool('write_parameters').parameter_file()
+    content = yaml.safe_load(text)
     sections = {name: body['ros__parameters'] for name, body in content.items()}
     listed = {name: value for body in sections.values() for name, value in body.items()}
     fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
@@ -93,11 +91,9 @@ def test_a_vehicle_gets_every_package() -> None:
     'path', sorted((CONFIG / 'examples').glob('*.yaml')), ids=lambda path: path.stem
 )
 def test_examples_load(path) -> None:
-    if path.stem.endswith('_camera'):
-        assert read_camera_info(str(path)).width > 0
-        return
-    setup = read_setup(path)
-    assert setup.prior.camera.width > 0
+    is_camera = path.stem.endswith('_camera')
+    camera = read_camera_info(path) if is_camera else read_setup(path).prior.camera
+    assert camera.width > 0
 
 
 @pytest.mark.slow
@@ -126,16 +122,13 @@ def test_the_recorder_and_the_aggregator_know_the_names_of_the_interface_documen
     assert f'Its `name` is `{diagnostics["starcal"]["startswith"][0]}` and' in names
 
 
-def test_every_pin_has_its_digests() -> None:
+def test_every_pin_has_its_digests_which_pip_is_given(tmp_path) -> None:
     """And there are none of other versions: `tools.write_hashes` was run after the last change."""
     lines = (ROOT / 'requirements/hashes.txt').read_text().splitlines()
     hashed = [line.split() for line in lines if not line.startswith('#')]
     assert {tuple(pin.split('==')) for pin, _, _ in hashed} == tool('write_hashes').pins()
     for _, digest, file in hashed:
         assert re.fullmatch('sha256:[0-9a-f]{64}', digest), file
-
-
-def test_pip_is_given_the_digests(tmp_path) -> None:
     make_venv, path = tool('make_venv'), tmp_path / 'some.txt'
     path.write_text('# why\nempy==3.3.4 ; python_version > "3.9"  # old\n')
     (line,) = make_venv.hashed_lines(path)
@@ -155,17 +148,11 @@ NODE_KEYWORDS = {
 
 
 def calls(path: Path, name: str) -> list[ast.Call]:
-    """Calls of a function in a file."""
-    tree = ast.parse(path.read_text())
-    return [
-        node
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == name
-    ]
+    found = (node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call))
+    return [node for node in found if isinstance(node.func, ast.Name) and node.func.id == name]
 
 
 def constants(node: ast.AST) -> list[Any]:
-    """Constants in a part of the tree."""
     return [one.value for one in ast.walk(node) if isinstance(one, ast.Constant)]
 
 
@@ -180,15 +167,8 @@ def declared(path: Path) -> set[str]:
 
 
 def included(path: Path) -> list[Path]:
-    """Launch files that one includes."""
     words = [word for call in calls(path, 'IncludeLaunchDescription') for word in constants(call)]
     return [path.with_name(word) for word in words if str(word).endswith('.launch.py')]
-
-
-def used(path: Path) -> set[str]:
-    """Arguments used in a launch file."""
-    found = (call.args[0] for call in calls(path, 'LaunchConfiguration'))
-    return {str(argument.value) for argument in found if isinstance(argument, ast.Constant)}
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
@@ -201,7 +181,9 @@ def test_composed_of_launch_alone(path) -> None:
         assert not isinstance(node, ast.Import)
     for call in calls(path, 'DeclareLaunchArgument'):
         assert 'description' in {keyword.arg for keyword in call.keywords}
-    assert used(path) <= declared(path)
+    used = (call.args[0] for call in calls(path, 'LaunchConfiguration'))
+    names = {str(argument.value) for argument in used if isinstance(argument, ast.Constant)}
+    assert names <= declared(path)
 
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
@@ -233,15 +215,8 @@ def test_parameters_are_those_of_the_nodes() -> None:
 
 def test_topics_are_inputs_of_the_star_observer() -> None:
     tree = ast.parse((ROOT / 'launch' / 'starcal.launch.py').read_text())
-    (topics,) = (
-        node.value
-        for node in ast.walk(tree)
-        if isinstance(node, ast.Assign)
-        and constants(node.targets[0]) == []
-        and isinstance(node.value, ast.Tuple)
-        and isinstance(node.targets[0], ast.Name)
-        and node.targets[0].id == 'TOPICS'
-    )
+    assigned = [node for node in ast.walk(tree) if isinstance(node, ast.Assign)]
+    (topics,) = (node.value for node in assigned if ast.unparse(node.targets[0]) == 'TOPICS')
     source = (ROOT / 'docs' / 'nodes.md').read_text().partition('## calibrator')[0]
     for topic in constants(topics):
         assert f'| sub | `{topic}` |' in source
@@ -289,7 +264,6 @@ def paths(content: object, key: str = '') -> Iterator[str]:
 
 
 def placed(layout: object) -> Iterator[str]:
-    """The panels at the leaves of a layout."""
     if isinstance(layout, str):
         yield layout
     else:
@@ -340,13 +314,9 @@ def without_types(source: str) -> str:
 
 
 def made_by(name: str, folder: Path, *events: dict[str, Any]) -> Any:
-    """Return what a script makes of the last of some events."""
     (folder / 'script.mjs').write_text(without_types(SCRIPTS[name]))
     (folder / 'run.mjs').write_text(_RUN)
-    done = subprocess.run(
-        [NODE, 'run.mjs', json.dumps(events)],
-        cwd=folder, capture_output=True, text=True,
-    )  # fmt: skip
+    done = run(NODE, 'run.mjs', json.dumps(events), cwd=folder)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)
 
@@ -354,9 +324,7 @@ def made_by(name: str, folder: Path, *events: dict[str, Any]) -> Any:
 @pytest.mark.skipif(not NODE, reason='no Node on this machine')
 def test_scripts_make_a_picture_and_ratios(tmp_path) -> None:
     coverage = {'coverage': [0, 1, 2, 4], 'coverage_rows': 2, 'coverage_cols': 2, 'header': {}}
-    collected = {
-        'parameter_names': ['fx', 'cx'], 'predicted_sigma': [0.5, 3.0], **coverage
-    }  # fmt: skip
+    collected = {'parameter_names': ['fx', 'cx'], 'predicted_sigma': [0.5, 3.0], **coverage}
     status = {'topic': '/ensemble_status', 'message': collected}
     picture = made_by('coverage', tmp_path, status)
     assert (picture['height'], picture['width'], picture['step']) == (64, 64, 64)
@@ -364,12 +332,8 @@ def test_scripts_make_a_picture_and_ratios(tmp_path) -> None:
     assert cells == [0, 64 + 48, 64 + 96, 255]
     check = {'option': 'max_x', 'found': 0.5, 'limit': 2.0}
     gate = [check, {'option': 'min_x', 'found': 8.0, 'limit': 2.0}, {**check, 'limit': None}]
-    active = {
-        'topic': '/calibration',
-        'message': {
-            'parameter_names': ['fx', 'cy'], 'covariance': [4.0, 0.0, 0.0, 1.0], 'gate': gate
-        },
-    }  # fmt: skip
+    message = {'parameter_names': ['fx', 'cy'], 'covariance': [4.0, 0.0, 0.0, 1.0], 'gate': gate}
+    active = {'topic': '/calibration', 'message': message}
     assert made_by('limits', tmp_path, active) == {'of_limit': [0.25, 0.25]}
     # cx was held in the active calibration: JSON writes NaN as null.
     assert made_by('sigmas', tmp_path, active, status) == {'over_active': [0.25, None]}

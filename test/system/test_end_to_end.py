@@ -16,6 +16,7 @@ from mission_files import params_with  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from starcal_tool import run_python  # type: ignore[import-not-found]
 import yaml
 
 from starcal_ground.bags.frames import read_telemetry
@@ -56,32 +57,27 @@ def assert_close_to_truth(calibration: Calibration, truth: CameraGeometry) -> No
     assert compared.total.value < count + 5 * np.sqrt(2 * count)  # 5 deviations of chi^2
 
 
-def test_the_tiny_bag_gives_the_truth(tiny_products) -> None:
-    calibration = read_calibration(tiny_products / 'calibration.json')
+def test_the_tiny_bag_gives_the_truth(tiny, tiny_products) -> None:
     truth = read_truth(TINY / 'truth.json')
-    assert calibration.accepted and calibration.reasons == ()
-    assert calibration.images_used == 10 and calibration.images_refused == {}
-    assert_close_to_truth(calibration, truth)
+    assert tiny.accepted and tiny.reasons == ()
+    assert tiny.images_used == 10 and tiny.images_refused == {}
+    assert_close_to_truth(tiny, truth)
     # The prior is 1 px of distortion and 150" of alignment off; a tenth of that must not stay.
     prior = CameraGeometry(
-        read_camera_info(TINY / 'camera.yaml'), calibration.geometry.star_tracker_from_camera_xyzw
+        read_camera_info(TINY / 'camera.yaml'), tiny.geometry.star_tracker_from_camera_xyzw
     )
-    before = dataclasses.replace(calibration, geometry=prior)
+    before = dataclasses.replace(tiny, geometry=prior)
     (_, error_px), (_, prior_error_px) = (
-        compare(one, truth_like(one, truth)).after.worst_and_rms_px
-        for one in (calibration, before)
+        compare(one, truth_like(one, truth)).after.worst_and_rms_px for one in (tiny, before)
     )
     assert error_px < 0.2 * prior_error_px
-
-
-def test_camera_info_is_the_calibration_without_skew(tiny_products) -> None:
-    calibration = read_calibration(tiny_products / 'calibration.json')
+    # Its camera_info has no skew.
     camera = read_camera_info(tiny_products / 'camera_info.yaml')
     assert camera.parameters[1] == 0.0
     grid = pixel_grid(camera, 25, 25)
-    error_px = project(camera, line_of_sight(calibration.geometry.camera, grid)) - grid
-    worst_px = np.linalg.norm(error_px, axis=-1).max()
-    assert worst_px == pytest.approx(calibration.zero_skew_cost_px, rel=1e-6)
+    moved_px = project(camera, line_of_sight(tiny.geometry.camera, grid)) - grid
+    worst_px = np.linalg.norm(moved_px, axis=-1).max()
+    assert worst_px == pytest.approx(tiny.zero_skew_cost_px, rel=1e-6)
 
 
 def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path, starcal) -> None:
@@ -91,17 +87,13 @@ def test_recorded_observations_give_the_same_calibration(tiny_products, tmp_path
     done = starcal('calibrate', tiny_products / 'observations.mcap', *given)
     assert done.status == 0 and f'\nproducts written to {tmp_path}\n' in done.out, done.err
     assert not (tmp_path / 'report.html').exists()
-    first, second = (
-        json.loads((folder / 'calibration.json').read_text())
-        for folder in (tiny_products, tmp_path)
-    )
+    files = (folder / 'calibration.json' for folder in (tiny_products, tmp_path))
+    first, second = (json.loads(path.read_text()) for path in files)
     second['provenance'] = first['provenance']  # the one names images, the other observations
     assert first == second
 
 
-def test_the_gate_refuses_with_status_3_and_writes_the_products(
-    few_images, tmp_path, starcal
-) -> None:
+def test_the_gate_refuses_with_status_3_and_writes_products(few_images, tmp_path, starcal) -> None:
     of_nodes = {'autostart': True, 'attitude_timeout_s': 2.0, 'use_sim_time': True}
     params = params_with(tmp_path, max_change_px=1e-6, **of_nodes)
     done = starcal('calibrate', few_images, '--params', params, '-o', tmp_path / 'out')
@@ -122,10 +114,8 @@ def test_the_tiny_bag_is_small_and_says_what_it_is() -> None:
     geometry = simulated_bag.true_geometry(truth)
     angles_rad = alignment_difference_rad(geometry, made.truth)
     assert np.abs(angles_rad).max() < 1e-14  # there and back through a matrix
-    assert read_camera_info(TINY / 'camera.yaml').parameters.tolist() == [
-        *truth['k_prior'],
-        *truth['d_prior'],
-    ]
+    prior = read_camera_info(TINY / 'camera.yaml')
+    assert prior.parameters.tolist() == [*truth['k_prior'], *truth['d_prior']]
 
 
 def test_bright_stars_of_the_bag_stand_where_truth_and_attitude_say() -> None:
@@ -171,9 +161,8 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
     whole = (TINY / 'tiny_0.mcap').read_bytes()
     bag = tmp_path / 'cut.mcap'
     bag.write_bytes(whole[: len(whole) * 7 // 10])
-    tool = [sys.executable, '-m', 'starcal_ground.cli.main', 'calibrate', bag, '--no-report']
-    given = ['--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
-    done = subprocess.run([*tool, *given], capture_output=True, text=True, check=False)
+    given = ['calibrate', bag, '--params', TINY / 'params.yaml', '-o', tmp_path / 'out']
+    done = run_python('-m', 'starcal_ground.cli.main', *given, '--no-report')
     assert done.returncode == 0, done.stderr
     damage, refused = done.stderr.splitlines()
     assert 'truncated' in damage and '1 of 7 images refused, no_attitude' in refused

@@ -12,11 +12,11 @@ import doctest
 import json
 from pathlib import Path
 import shutil
-import subprocess
 import sys
 import typing
 
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 import starcal_ground
 from starcal_ground.comparison import Comparison
@@ -28,15 +28,9 @@ EXAMPLES = Path(__file__).resolve().parents[2] / 'examples'
 TINY = EXAMPLES.parent / 'bags' / 'tiny'
 
 
-def run(cwd: Path, *command: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, *map(str, command)], cwd=cwd, capture_output=True, text=True
-    )
-
-
 @pytest.mark.slow
 def test_from_arrays(tmp_path) -> None:
-    done = run(tmp_path, EXAMPLES / 'from_arrays.py')
+    done = run_python(EXAMPLES / 'from_arrays.py', cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     verdict, *rows, sight = done.stdout.splitlines()
     assert verdict == 'accepted' and len(rows) == 10
@@ -51,22 +45,18 @@ def test_from_arrays(tmp_path) -> None:
 def test_from_bag(few_images, tmp_path) -> None:
     written = tmp_path / 'calibration.json'
     params = few_images / 'params.yaml'
-    done = run(tmp_path, EXAMPLES / 'from_bag.py', few_images, params, written)
+    done = run_python(EXAMPLES / 'from_bag.py', few_images, params, written, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
     assert len(done.stdout.splitlines()) == 10
     assert read_calibration(written).accepted
-
-
-def test_from_a_bag_that_is_not_there(tmp_path) -> None:
-    done = run(tmp_path, EXAMPLES / 'from_bag.py', 'none', TINY / 'params.yaml', 'out.json')
-    assert (done.returncode, done.stdout) == (2, '')
-    assert done.stderr == 'none: no such file or folder\n'
 
 
 @pytest.mark.slow
 def test_notebook(monkeypatch) -> None:
     """Each code cell in turn, in one namespace: what Jupyter does, without Jupyter."""
     cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
+    for cell in cells:  # it is kept without outputs
+        assert not cell.get('outputs') and cell.get('execution_count') is None
     sources = [''.join(cell['source']) for cell in cells if cell['cell_type'] == 'code']
     assert len(sources) >= 5
     monkeypatch.chdir(EXAMPLES)
@@ -76,29 +66,35 @@ def test_notebook(monkeypatch) -> None:
     assert 'calibration' in names
 
 
-def test_the_notebook_is_kept_without_outputs() -> None:
-    cells = json.loads((EXAMPLES / 'calibrate.ipynb').read_text())['cells']
-    for cell in cells:
-        assert not cell.get('outputs') and cell.get('execution_count') is None
-
-
 @pytest.mark.slow
 def test_mission(few_images, tmp_path) -> None:
     """FITS and AEM to kernels that spiceypy loads, with the boresight of the calibration."""
     params = few_images / 'params.yaml'
-    done = run(tmp_path, EXAMPLES / 'mission.py', few_images, params, tmp_path / 'mission')
+    done = run_python(
+        EXAMPLES / 'mission.py', few_images, params, tmp_path / 'mission', cwd=tmp_path
+    )
     assert (done.returncode, done.stderr) == (0, '')
     difference = done.stdout.splitlines()[-1].removeprefix('difference from the calibration: ')
     assert float(difference.split()[0]) < 1e-9
     assert (tmp_path / 'mission/camera.ti').read_text().startswith('KPL/IK')
 
 
-@pytest.mark.parametrize('name', ['from_bag.py', 'mission.py'])
-def test_without_arguments_the_usage_is_printed(name, tmp_path) -> None:
-    done = run(tmp_path, EXAMPLES / name)
-    assert done.returncode == 2
-    assert done.stderr.startswith(f'usage: python {name} BAG PARAMS ')
-    assert done.stderr.count('\n') == 1
+@pytest.mark.parametrize(
+    ('name', 'given', 'words'),
+    [
+        ('from_bag.py', (), 'usage: python from_bag.py BAG PARAMS '),
+        ('mission.py', (), 'usage: python mission.py BAG PARAMS '),
+        (
+            'from_bag.py',
+            ('none', TINY / 'params.yaml', 'o.json'),
+            'none: no such file or folder\n',
+        ),
+    ],
+)
+def test_missing_arguments_and_a_missing_bag_are_one_line(name, given, words, tmp_path) -> None:
+    done = run_python(EXAMPLES / name, *given, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, '')
+    assert done.stderr.startswith(words) and done.stderr.count('\n') == 1
 
 
 PUBLIC = [

@@ -14,7 +14,6 @@ from pathlib import Path
 import re
 import shlex
 import shutil
-import subprocess
 import sys
 import sysconfig
 from xml.etree import ElementTree
@@ -22,6 +21,7 @@ from xml.etree import ElementTree
 from packaging.requirements import Requirement
 import pytest
 from ros_tools import HIDDEN  # type: ignore[import-not-found]
+from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
 TUTORIAL = ROOT / 'docs' / 'tutorial.md'
@@ -31,12 +31,6 @@ MADE = ('.*cache*', '.hypothesis', '*.egg-info', '__pycache__', '_build', 'gener
 SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = ('dask', 'distributed', 'sphinx', 'spiceypy')
 PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
-
-
-def run(
-    *command: str | Path, cwd: Path = ROOT, env: dict[str, str] | None = None
-) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True)
 
 
 def required(installed: metadata.Distribution, extra: str) -> set[str]:
@@ -80,10 +74,9 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope='module')
 def unpacked(sources: Path) -> Path:
-    """The source archive, unpacked."""
-    packed = run(sys.executable, '-c', SDIST, cwd=sources)
+    packed = run_python('-c', SDIST, cwd=sources)
     assert packed.returncode == 0, packed.stderr
-    archive = sources.parent / packed.stdout.splitlines()[-1]
+    archive: Path = sources.parent / packed.stdout.splitlines()[-1]
     run('tar', 'xzf', archive, cwd=sources.parent)
     return archive.with_suffix('').with_suffix('')
 
@@ -105,7 +98,7 @@ def installed(wheel: Path, folder: Path, extra: str) -> Path:
     starcal is installed by pip; what it requires is linked from this environment.
     """
     venv = folder / 'venv'
-    made = run(sys.executable, '-m', 'venv', '--without-pip', venv, cwd=folder)
+    made = run_python('-m', 'venv', '--without-pip', venv, cwd=folder)
     if made.returncode:
         pytest.skip(f'no venv can be made here: {made.stderr}')
     to_venv = ('--python', venv / 'bin/python')
@@ -135,9 +128,7 @@ def test_the_source_archive_is_complete(sources, unpacked) -> None:
         name for name in clone - archive if name[0] != '.' and '.egg-info' not in name
     } == set()
     tests = ('test/onboard/camera', 'test/system/test_named_in_documents.py')
-    done = run(
-        sys.executable, '-m', 'pytest', '-q', '-p', 'no:cacheprovider', *tests, cwd=unpacked
-    )
+    done = run_python('-m', 'pytest', '-q', '-p', 'no:cacheprovider', *tests, cwd=unpacked)
     assert done.returncode == 0, done.stdout
 
 
@@ -165,10 +156,8 @@ def test_a_bag_is_calibrated_without_extras(flight_install, tmp_path) -> None:
     )
     done = run(python, '-W', 'error', '-c', write, tiny, params, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (0, '')
-    made, again = (
-        json.loads((tmp_path / name).read_text())
-        for name in ('out/calibration.json', 'again.json')
-    )
+    files = (tmp_path / 'out/calibration.json', tmp_path / 'again.json')
+    made, again = (json.loads(path.read_text()) for path in files)
     assert made['accepted'] and made['intrinsics'] == again['intrinsics']
 
 
@@ -220,7 +209,7 @@ try:
 except ArchiveError as error:
     print(error)
 """
-    done = run(sys.executable, '-c', source, env=vehicle)
+    done = run_python('-c', source, env=vehicle, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     assert 'python -m pip install mcap rosbags, or leave state_dir' in done.stdout
     params = TINY / 'params.yaml'
@@ -228,7 +217,7 @@ except ArchiveError as error:
         ('starcal_ros.entry_points', 'bag_player'),
         ('starcal_ground.cli.main', 'calibrate', TINY, '--params', params, '-o', 'none'),
     ):
-        refused = run(sys.executable, '-m', *words, env=vehicle)
+        refused = run_python('-m', *words, env=vehicle, cwd=ROOT)
         assert refused.returncode == 2, refused.stderr
         assert 'python -m pip install mcap rosbags' in refused.stderr
         assert refused.stderr.count('\n') == 1

@@ -99,12 +99,7 @@ def words() -> frozenset[str]:
 
 def resolves(name: str) -> bool:
     """True for ``[room/]module[.class].attribute``, or a name of another package."""
-    path = (
-        name.replace('/', '.')
-        .removeprefix('starcal_ros.')
-        .removeprefix('starcal_ground.')
-        .split('.')
-    )
+    path = re.sub(r'^starcal_(ros|ground)\.', '', name.replace('/', '.')).split('.')
     is_ours = False
     for count in range(len(path), 0, -1):
         tail = '.' + '.'.join(path[:count])
@@ -227,12 +222,8 @@ def identifiers() -> frozenset[str]:
     [
         *('estimation/calibrate.no_such', 'equations.Equations.no_such'),
         *('docs/no_such.md', 'no_such_option', '--no-such'),
-        *(
-            'pytest test/onboard/test_api.py -k no_such',
-            'bench no_such',
-            'no such message',
-            'no_such.py',
-        ),
+        *('pytest test/onboard/test_api.py -k no_such', 'bench no_such', 'no such message'),
+        'no_such.py',
     ],
 )
 def test_a_name_that_does_not_exist_is_found(span) -> None:

@@ -35,11 +35,8 @@ BY_COMMAND = {
 }
 
 
-def test_every_picture_has_its_command() -> None:
+def test_every_picture_has_its_command_and_the_graph_the_topics_of_the_nodes() -> None:
     assert set().union(*BY_COMMAND.values()) == SHOWN
-
-
-def test_the_graph_of_the_nodes_is_the_drawn_one_and_names_their_topics() -> None:
     assert (IMAGES / 'nodes.svg').read_text() == make_nodes.nodes().document()
     interface = (ROOT / 'docs' / 'nodes.md').read_text()
     labels = [*(label for *_, labels in make_nodes.TOPICS for label in labels),

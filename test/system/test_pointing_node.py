@@ -8,7 +8,6 @@ import os
 from pathlib import Path
 import subprocess
 import sys
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -20,15 +19,13 @@ from starcal_ground.mission.export.request import Request
 from starcal_ros.camera import line_of_sight
 from starcal_ros.records import Calibration
 
-if TYPE_CHECKING:
-    from conftest import Client
-
 pytest.importorskip('rclpy')
 
 from export_calibrations import calibration  # type: ignore[import-not-found]
 from geometry_msgs.msg import PointStamped, Vector3Stamped
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import SetParameters
+from starcal_tool import run  # type: ignore[import-not-found]
 
 pytestmark = [pytest.mark.nodes, pytest.mark.packaging, pytest.mark.slow]
 EXAMPLE = Path(__file__).resolve().parents[2] / 'examples' / 'pointing_node'
@@ -51,21 +48,19 @@ def node(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ('cmake', '-S', EXAMPLE, '-B', folder / 'build', *definitions),
         ('cmake', '--build', folder / 'build'),
     ):
-        done = subprocess.run(command, env=build, capture_output=True, text=True, check=False)
+        done = run(*command, env=build)
         assert done.returncode == 0, done.stdout + done.stderr
     return folder / 'build' / 'pointing_node'
 
 
 @pytest.fixture
-def started(node: Path, client: Client) -> Iterator[None]:
+def started(node: Path) -> Iterator[None]:
     with subprocess.Popen([node]) as process:
         yield
         process.kill()
 
 
-def test_it_answers_with_the_lines_of_sight_of_the_python_package(
-    client, started, tmp_path
-) -> None:
+def test_it_answers_with_lines_of_sight_of_the_python_package(client, started, tmp_path) -> None:
     answers = client.collect(Vector3Stamped, 'line_of_sight')
     client.until(lambda: client.node.count_publishers('line_of_sight'))
     pixels = client.publisher(PointStamped, 'pixel')
@@ -101,8 +96,7 @@ def test_it_answers_with_the_lines_of_sight_of_the_python_package(
 
 
 def test_a_bad_table_at_the_start_costs_one_line(node, tmp_path) -> None:
-    command: list[str | Path] = [node, '--ros-args', '-p', f'table:={tmp_path / "none"}']
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run(node, '--ros-args', '-p', f'table:={tmp_path / "none"}')
     assert done.returncode == 2
     assert 'none: cannot be read' in done.stderr and done.stderr.count('\n') == 1
 

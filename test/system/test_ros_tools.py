@@ -16,6 +16,7 @@ from typing import Any
 
 from mission_files import params_with  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 pytest.importorskip('rclpy')
 pytest.importorskip('starcal.msg')
@@ -59,7 +60,6 @@ def rosbag2(tools: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
 
 @pytest.fixture
 def make(tools: Path, tmp_path: Path, has_failed: Callable[[], bool]) -> Iterator[Make]:
-    """Make the tools for a middleware, with more variables of the environment."""
     made: list[RosTools] = []
 
     def make(rmw: str, **more: str) -> RosTools:
@@ -110,10 +110,11 @@ def test_launch_replay_calibrate_and_record(rosbag2, ros2, tiny_bag, tmp_path) -
     assert launch.said().count('process has finished cleanly') == 2, launch.said()
 
 
-def test_launch_arguments_are_shown(make) -> None:
+def test_launch_arguments_are_shown_and_a_missing_one_is_named(make) -> None:
     for file in ('starcal.launch.py', 'replay.launch.py'):
         shown = make(FAST).run('launch', 'starcal', file, '--show-args')
         assert shown.returncode == 0 and "'params_file':" in shown.stdout, shown.stderr
+    make(FAST).start('launch', 'starcal', 'starcal.launch.py').until_said('camera_info_url')
 
 
 def test_replay_launch(make, client, tiny_bag, tmp_path) -> None:
@@ -138,9 +139,7 @@ def test_replay_launch(make, client, tiny_bag, tmp_path) -> None:
     ('argument', 'says'),
     [('rate:=abc', "bag_player: rate: 'abc' is not a number"), ('respawn:=abc', "got 'abc'")],
 )
-def test_a_wrong_launch_argument_leaves_no_process(
-    make, tiny_bag, tmp_path, argument, says
-) -> None:
+def test_a_wrong_argument_leaves_no_process(make, tiny_bag, tmp_path, argument, says) -> None:
     """The launch ends by itself, and the nodes with it: another calibrator can have the folder."""
     ros2 = make(FAST)
     params = params_with(tmp_path, state_dir=str(tmp_path / 'state'))
@@ -153,23 +152,14 @@ def test_a_wrong_launch_argument_leaves_no_process(
     Archive(tmp_path / 'state', 'camera').close()
 
 
-def test_a_launch_without_a_parameter_file_names_what_to_set(make) -> None:
-    launch = make(FAST).start('launch', 'starcal', 'starcal.launch.py')
-    launch.until_said('camera_info_url')
-
-
-def test_two_cameras_with_one_frame_are_named(
-    make, client, tiny_bag, tiny_products, tmp_path
-) -> None:
+def test_two_cameras_with_one_frame_are_named(make, client, tiny_bag, tiny, tmp_path) -> None:
     """In namespaces of their own, but with one transform; another name of the frame mends it."""
     ros2 = make(FAST)
     params = ('--params-file', tiny_bag / 'params.yaml')
-    stored = read_calibration(tiny_products / CALIBRATION_FILE)
     for k, name in enumerate(('left', 'right', 'third')):
-        frame = 'third' if name == 'third' else stored.child_frame
-        one = dataclasses.replace(
-            stored, number=1, active_since_ns=1, time_ns=stored.time_ns + k, child_frame=frame
-        )
+        frame = 'third' if name == 'third' else tiny.child_frame
+        stamps = {'active_since_ns': 1, 'time_ns': tiny.time_ns + k}
+        one = dataclasses.replace(tiny, number=1, child_frame=frame, **stamps)
         with contextlib.closing(Archive(tmp_path / name, frame)) as archive:
             archive.keep(Ensemble(), (Activation(1, 0, one),))
         options = ('-r', f'__ns:=/{name}', '-p', f'state_dir:={tmp_path / name}')
@@ -180,7 +170,7 @@ def test_two_cameras_with_one_frame_are_named(
         heard = [one.status[0] for one in told if f'{name}/calibrator' in one.status[0].name]
         return str(heard[-1].message) if heard else ''
 
-    says = f'/tf_static: another node publishes {stored.child_frame} too: give each camera its own'
+    says = f'/tf_static: another node publishes {tiny.child_frame} too: give each camera its own'
     for name in ('left', 'right'):
         client.until(lambda name=name: message(name).startswith(says))
     client.until(lambda: message('third') == 'calibration active')
@@ -203,11 +193,7 @@ def test_lifecycle_and_parameters(make, tiny_bag, tmp_path) -> None:
         # for ever, but the node has made the transition.
         with contextlib.suppress(subprocess.TimeoutExpired):
             made = ros2.run('lifecycle', 'set', '/calibrator', transition, timeout_s=ANSWER_S)
-            assert 'Transitioning successful' in made.stdout, (
-                transition,
-                made.stderr,
-                node.said(),
-            )
+            assert 'Transitioning successful' in made.stdout, made.stderr + node.said()
         ros2.until(state, 'lifecycle', 'get', '/calibrator')
         if state == 'inactive':
             answer = ros2.run('service', 'call', '/calibrator/calibrate', TRIGGER)
@@ -296,10 +282,8 @@ def done(process: subprocess.CompletedProcess[str]) -> str:
 
 
 def as_sqlite(folder: Path) -> None:
-    nothing: tuple[()] = ()  # no topics or types are left out, or taken alone
-    convert(
-        *([TINY], folder, 'sqlite3', 9, None, '', None, None, nothing, nothing, nothing, nothing)
-    )
+    nothing = [()] * 4  # no topics or types are left out, or taken alone
+    convert([TINY], folder, 'sqlite3', 9, None, '', None, None, *nothing)
 
 
 def as_damaged(folder: Path) -> None:
@@ -337,15 +321,9 @@ def test_without_the_wheels_rosbag2_reads_bags(
     write(tmp_path / 'bag')
     (tmp_path / 'sitecustomize.py').write_text(HIDDEN)
     path = f'{tmp_path}:{ROOT}:{ros2.environment["PYTHONPATH"]}'
-    words = ('calibrate', 'bag', '--params', str(TINY / 'params.yaml'), '-o', 'out')
-    done = subprocess.run(
-        [sys.executable, '-m', 'starcal_ground.cli.main', *words],
-        env=ros2.environment | {'PYTHONPATH': path},
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    words = ('calibrate', 'bag', '--params', TINY / 'params.yaml', '-o', 'out')
+    env = ros2.environment | {'PYTHONPATH': path}
+    done = run_python('-m', 'starcal_ground.cli.main', *words, env=env, cwd=tmp_path)
     install = f'{sys.executable} -m pip install mcap rosbags'
     if line:
         assert done.returncode == 2 and line.format(install=install) in done.stderr

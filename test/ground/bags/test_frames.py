@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-import subprocess
 import sys
 import threading
 from typing import Any
@@ -13,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
 from starcal_ground.bags import frames as frames_module
@@ -199,10 +199,7 @@ def test_memory_is_flat(tmp_path) -> None:
     """Fifty images need no more memory than fifteen, with an attitude after each only."""
     messages = [item for k in range(50) for item in (('attitude', 20 * k - 1), ('image', 20 * k))]
     path = write(tmp_path / 'long', [*messages, ('attitude', 1001)], size=1000)
-    done = subprocess.run(
-        [sys.executable, '-c', MEMORY, str(path)], capture_output=True, text=True, check=True
-    )
-    last, growth_kb = map(int, done.stdout.split())
+    last, growth_kb = map(int, run_python('-c', MEMORY, path).stdout.split())
     assert last == 49
     assert growth_kb < 32_000  # two batches of 8 MB and the heap; the images between are 68 MB
 

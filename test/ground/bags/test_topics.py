@@ -38,9 +38,8 @@ def setup_with(**others: object) -> Setup:
     return load_setup({**values, 'camera_info_url': str(TINY / 'camera.yaml'), **others})
 
 
-@pytest.fixture
-def bag(tmp_path: Path) -> Path:
-    """Two images as rgb8 (the stars in green) and the attitudes as TransformStamped."""
+def test_stars_are_found_in_the_channel_and_with_the_transforms(tmp_path) -> None:
+    """Of two images as rgb8 (the stars in green) and the attitudes as TransformStamped."""
     with BagWriter(tmp_path / 'bag') as writer:
         for time_ns, xyzw in attitudes():
             message = attitude_message(ALIGNMENT_TYPE, time_ns, xyzw)
@@ -50,25 +49,24 @@ def bag(tmp_path: Path) -> Path:
             black = np.zeros_like(green)
             colours = cv2.merge([black, green, black])
             write_encoded(writer, '/image', image, 'rgb8', colours)
-    return tmp_path / 'bag'
-
-
-def test_stars_are_found_in_the_channel_and_with_the_transforms(bag) -> None:
     setup = setup_with(image_channel='green')
-    chosen = topics.choose_topics([bag], Topics(), setup)
+    chosen = topics.choose_topics([tmp_path / 'bag'], Topics(), setup)
     assert chosen.attitude == '/attitude'
-    records = list(topics.read([bag], chosen, setup))
+    records = list(topics.read([tmp_path / 'bag'], chosen, setup))
     assert [record.refusal for record in records] == ['', '']
     # 8 of 16 bit are left: the faint stars are gone, 15 of 300 remain.
     assert min(len(record) for record in records) > 10
+    # Images that cannot be decoded are chosen by their stamps too.
+    wanted = images()[1].time_ns
+    (record,) = topics.read([tmp_path / 'bag'], chosen, setup_with(), wanted=wanted.__eq__)
+    assert (record.time_ns, record.refusal) == (wanted, 'bad_encoding')
 
 
-SEVERAL = 'several topics may hold the attitudes: '
+SEVERAL = r'several topics may hold the attitudes: /a \(Imu\), /b \(PoseStamped\); choose'
 NOT_READ = (
     'no topic of type .*QuaternionStamped.*; /a is a PoseWithCovarianceStamped, which is not read'
     ': publish its orientation as a QuaternionStamped or PoseStamped, and choose that with'
-    ' --attitude-topic; starcal calibrate'
-    ' --camera-alone'
+    ' --attitude-topic; starcal calibrate --camera-alone'
 )
 
 
@@ -101,11 +99,7 @@ def test_the_topic_of_the_attitudes_follows_from_the_types(tmp_path, kinds, aske
 @pytest.mark.parametrize(
     ('kinds', 'asked', 'said'),
     [
-        (
-            {'/a': IMU_TYPE, '/b': POSE_TYPE},
-            '',
-            rf'{SEVERAL}/a \(Imu\), /b \(PoseStamped\); choose',
-        ),
+        ({'/a': IMU_TYPE, '/b': POSE_TYPE}, '', SEVERAL),
         ({'/a': ATTITUDE_TYPE, '/b': ATTITUDE_TYPE}, '', 'choose one with --attitude-topic$'),
         ({'/a': ATTITUDE_TYPE}, 'b', r'no topic b of type .*Stamped \(available: /a\)'),
         ({'/a': 'geometry_msgs/msg/PoseWithCovarianceStamped'}, '', NOT_READ),
@@ -154,13 +148,6 @@ def test_images_in_another_order_are_all_used(tmp_path) -> None:
     assert [(record.time_ns, record.refusal) for record in records] == [(t, '') for t in expected]
 
 
-def test_images_that_cannot_be_decoded_are_chosen_by_their_stamps_too(bag) -> None:
-    setup, wanted = setup_with(), images()[1].time_ns
-    chosen = topics.choose_topics([bag], Topics(), setup)
-    records = list(topics.read([bag], chosen, setup, wanted=wanted.__eq__))
-    assert [(record.time_ns, record.refusal) for record in records] == [(wanted, 'bad_encoding')]
-
-
 @pytest.mark.parametrize('stray', ['', '/attitude', '/image', '/velocity'])
 @pytest.mark.parametrize('is_first', [True, False])
 def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
@@ -194,11 +181,6 @@ def test_messages_of_another_type_on_a_topic_are_left_out_and_named(
 ODOMETRY, TF = 'nav_msgs/msg/Odometry', 'tf2_msgs/msg/TFMessage'
 
 
-def of_four_images(path: Path, kind: str) -> Path:
-    """A bag of four images and a message of a type that is not read; empty: none."""
-    return with_topics(path, {'/gnc/state': kind} if kind else {}, 4)[0]
-
-
 def params(folder: Path, **options: object) -> Path:
     path = folder / 'params.yaml'
     values = {'camera_info_url': str(TINY / 'camera.yaml'), **options}
@@ -214,7 +196,7 @@ STATED = {'prior_alignment': [0.0, 0.0, 0.0, 1.0], 'star_tracker_sigma_arcsec': 
 def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_command(
     kind, stated, tmp_path, starcal
 ) -> None:
-    bag = of_four_images(tmp_path / 'bag.mcap', kind)
+    bag = with_topics(tmp_path / 'bag.mcap', {'/gnc/state': kind} if kind else {}, 4)[0]
     given = ['--params', str(params(tmp_path, **{stated: STATED[stated]}))]
     for command, status in (
         (['calibrate', bag, *given, '-o', tmp_path / 'out'], 2),
@@ -236,7 +218,7 @@ def test_a_stated_star_tracker_that_is_not_in_the_bag_is_an_error_of_every_comma
 def test_diagnose_takes_images_without_attitudes_where_calibrate_does(
     kind, options, tmp_path, starcal
 ) -> None:
-    bag = of_four_images(tmp_path / 'bag.mcap', kind)
+    bag = with_topics(tmp_path / 'bag.mcap', {'/gnc/state': kind} if kind else {}, 4)[0]
     stated = STATED if '--camera-alone' in options else {}
     words = {'PARAMS': ['--params', str(params(tmp_path, **stated))]}
     given = [word for option in options for word in words.get(option, [option])]
@@ -247,11 +229,9 @@ def test_diagnose_takes_images_without_attitudes_where_calibrate_does(
 
 @pytest.mark.slow
 @pytest.mark.parametrize('with_attitudes', [False, True])
-def test_the_camera_alone_is_calibrated_where_it_is_requested(
-    with_attitudes, tmp_path, starcal
-) -> None:
-    path = tmp_path / 'bag.mcap'
-    bag = write_tiny(path, images()[:4]) if with_attitudes else of_four_images(path, ODOMETRY)
+def test_the_camera_alone_is_calibrated_where_requested(with_attitudes, tmp_path, starcal) -> None:
+    path, other = tmp_path / 'bag.mcap', {'/gnc/state': ODOMETRY}
+    bag = write_tiny(path, images()[:4]) if with_attitudes else with_topics(path, other, 4)[0]
     given = ['--params', TINY / 'params.yaml']
     answer = starcal('calibrate', bag, '--camera-alone', '-o', tmp_path / 'out', *given)
     assert answer.status in (0, 3)
@@ -283,7 +263,5 @@ def test_a_clock_that_was_never_set_is_named(command, tmp_path, caplog) -> None:
     given = [*with_params, str(TINY / 'params.yaml')] if with_params else []
     out = ['-o', str(tmp_path / 'out'), '--no-report'] if name == 'calibrate' else []
     main([name, str(bag), *given, *out])
-    words = [
-        record.message for record in caplog.records if 'the clock was not set' in record.message
-    ]
+    words = [text for text in caplog.messages if 'the clock was not set' in text]
     assert len(words) == 1 and 'stamp images and attitudes in UTC' in words[0]

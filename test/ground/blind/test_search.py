@@ -131,7 +131,7 @@ def numbers(patterns: Patterns) -> Floats:
     return np.column_stack([places.view(np.float32), patterns['size']]).astype(np.float64)
 
 
-def test_a_shape_hangs_on_no_rotation_or_order() -> None:
+def test_a_shape_hangs_on_no_rotation_or_order_and_has_equivalent_orders() -> None:
     directions = random_fours(2, 50)
     patterns = of_fours(directions)
     turned = Rotation.random(random_state=3).apply(directions.reshape(-1, 3)).reshape(-1, 4, 3)
@@ -139,9 +139,6 @@ def test_a_shape_hangs_on_no_rotation_or_order() -> None:
     # Rounding to float32, places being below one and the logarithms below three.
     np.testing.assert_allclose(numbers(again), numbers(patterns), rtol=0, atol=3e-7)
     np.testing.assert_array_equal(np.array([2, 0, 3, 1])[again['order']], patterns['order'])
-
-
-def test_equivalent_orders_have_the_shape_of_their_stars() -> None:
     # With a tolerance beyond every shape, all four orders are near a border.
     every = equivalent(of_fours(random_fours(4, 1)), 2.0)
     assert len({tuple(order) for order in every['order'].tolist()}) == 4
@@ -149,7 +146,7 @@ def test_equivalent_orders_have_the_shape_of_their_stars() -> None:
 
 
 def test_the_grid_finds_what_the_definition_does() -> None:
-    """Every shape within the tolerances of any order, and no other."""
+    """Every shape within the tolerances of any order, and no other; outside of it none."""
     patterns = of_fours(random_fours(5, 3000))
     grid = pattern_grid([patterns])
     kept = numbers(grid.patterns)
@@ -169,16 +166,18 @@ def test_the_grid_finds_what_the_definition_does() -> None:
         # Differences are of float32: none of these lies within 1e-7 of a tolerance.
         got = {(*numbers(near)[k], n) for k, n in zip(query, row, strict=True)}
         assert got == expected and len(query) == len(got)
-
-
-def test_shapes_outside_the_grid_equal_none() -> None:
-    patterns = of_fours(random_fours(7, 100))
-    grid = pattern_grid([patterns])
     outside = patterns[:3].copy()
     outside['places'] = 9.0 + 9.0j
     for shown in (outside, outside[:0]):
         query, row = equal_patterns(grid, shown, 0.02, 0.2)
         assert len(query) == len(row) == 0
+
+
+def test_points_cover_the_sphere() -> None:
+    points = sphere_points(1000)
+    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-12)
+    # Even to a point: the mean of a thousand random ones would be 0.03 long.
+    assert np.linalg.norm(points.mean(axis=0)) < 1e-3
 
 
 @pytest.mark.parametrize('scale', [1, 7])
@@ -244,13 +243,6 @@ def test_the_chance_of_an_order_is_that_among_all_permutations() -> None:
         # Rounding of five convolutions.
         expected = pytest.approx(np.mean(wrong <= found), abs=1e-14)
         assert _chance_of_order(np.array(source)) == expected
-
-
-def test_points_cover_the_sphere() -> None:
-    points = sphere_points(1000)
-    np.testing.assert_allclose(np.linalg.norm(points, axis=1), 1.0, atol=1e-12)
-    # Even to a point: the mean of a thousand random ones would be 0.03 long.
-    assert np.linalg.norm(points.mean(axis=0)) < 1e-3
 
 
 @pytest.mark.parametrize('width_deg', [15, 55])

@@ -19,6 +19,7 @@ import sys
 
 from attacks import BAG, digests, many, NO_FILES  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import run  # type: ignore[import-not-found]
 
 from starcal_ground.cli import main
 from starcal_ground.mission.export.export_formats import FORMATS
@@ -32,10 +33,6 @@ def _prior_in_out(here: Path) -> None:
     (here / 'bag/params.yaml').write_text(
         text.replace('camera.yaml', str(here / 'out/camera_info.yaml'))
     )
-
-
-def _nothing(here: Path) -> None:
-    pass
 
 
 def _link(path: Path, target: Path) -> None:
@@ -53,10 +50,10 @@ def _picture(folder: Path) -> Path:
 _OWN = '--params HERE/bag/params.yaml -o'
 _IMPORT = 'import --images HERE/frames/0.png --times HERE/frames/times.csv --attitude'
 PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
-    'folder of the bag': (_nothing, f'calibrate HERE/bag {_OWN} HERE/bag'),
-    'folder of the file': (_nothing, f'calibrate HERE/bag/tiny_0.mcap {_OWN} HERE/bag'),
+    'folder of the bag': (Path.exists, f'calibrate HERE/bag {_OWN} HERE/bag'),
+    'folder of the file': (Path.exists, f'calibrate HERE/bag/tiny_0.mcap {_OWN} HERE/bag'),
     'observations of the folder': (
-        _nothing, f'calibrate HERE/out/observations.mcap {_OWN} HERE/out',
+        Path.exists, f'calibrate HERE/out/observations.mcap {_OWN} HERE/out',
     ),
     'link to the bag': (
         lambda here: _link(here / 'out/observations.mcap', here / 'bag/tiny_0.mcap'),
@@ -99,7 +96,7 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
         f'{_IMPORT} HERE/frames/import.json -o HERE/frames',
     ),
     'straight image over its original': (
-        _nothing, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
+        Path.exists, 'undistort HERE/out HERE/frames/0.png -o HERE/frames',
     ),
     'straight images of one name': (
         lambda here: shutil.copytree(here / 'frames', here / 'others'),
@@ -241,8 +238,7 @@ def test_what_starcal_did_not_write_is_not_replaced(command, campaign, tmp_path,
 def test_standard_streams_that_are_closed_full_or_abandoned(line, campaign) -> None:
     """Those of a result, and those of an error."""
     words = line.replace('OUT', str(campaign / 'out'))
-    command = f'{sys.executable} -m starcal_ground.cli.main {words}'
-    done = subprocess.run(['bash', '-c', command], capture_output=True, text=True)
+    done = run('bash', '-c', f'{sys.executable} -m starcal_ground.cli.main {words}')
     assert 'Traceback' not in done.stdout + done.stderr
     assert 'Exception' not in done.stdout + done.stderr
 

@@ -81,9 +81,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory, few_images: Path) -> Path:
     shutil.copytree(few_images, folder / 'in/bag')
     write_frames(folder / 'in/frames', 2)
     with contextlib.redirect_stdout(io.StringIO()):
-        assert (
-            _run('calibrate in/bag --params in/bag/params.yaml -o in/a', folder, lambda: None) == 0
-        )
+        line = 'calibrate in/bag --params in/bag/params.yaml -o in/a'
+        assert _run(line, folder, lambda: None) == 0
     return folder
 
 
@@ -101,7 +100,6 @@ def _run(command: str, folder: Path, look: Look) -> int:
 
 
 def _is_main_thread() -> bool:
-    """True where Python handles signals."""
     return threading.current_thread() is threading.main_thread()
 
 
@@ -130,9 +128,7 @@ def test_outputs_are_old_or_whole_before_each_operation(command, folder) -> None
 
 
 @each_command
-def test_an_interrupt_is_one_line_and_leaves_inputs_and_outputs_sound(
-    command, folder, capsys
-) -> None:
+def test_an_interrupt_is_one_line_and_leaves_all_files_sound(command, folder, capsys) -> None:
     """Runs that replace the products of an earlier one."""
     old, expected, operations = _whole_run(command, folder)
     inputs, draw = _inputs(folder), random.Random(14)

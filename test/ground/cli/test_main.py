@@ -18,7 +18,7 @@ import sys
 from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
-from starcal_tool import assert_refused  # type: ignore[import-not-found]
+from starcal_tool import assert_refused, run_python  # type: ignore[import-not-found]
 
 from starcal_ground.child_process import module_command
 from starcal_ground.cli import main, node_processes
@@ -28,19 +28,12 @@ from starcal_ground.cli.main import COMMANDS, parser
 from starcal_ros.constants import software_version
 
 
-def test_no_command_prints_the_help(starcal) -> None:
-    status, out, err = starcal()
-    assert (status, err) == (0, '')
-    assert out == parser().format_help()
-
-
-def test_version(starcal) -> None:
+def test_help_without_a_command_and_version(starcal) -> None:
+    assert starcal() == (0, parser().format_help(), '')
     assert starcal('--version') == (0, f'starcal {software_version()}\n', '')
 
 
-def test_lookup_writes_the_columns_of_the_interface_document(
-    starcal, tmp_path, tiny_products
-) -> None:
+def test_lookup_writes_the_columns_of_the_document(starcal, tmp_path, tiny_products) -> None:
     text = (Path(__file__).parents[3] / 'docs' / 'commands.md').read_text()
     (row,) = (line for line in text.splitlines() if line.startswith('| `starcal lookup '))
     lookup_columns = re.findall(r'`(\w+)`', row.split('|', 2)[2])
@@ -55,11 +48,10 @@ def test_lookup_writes_the_columns_of_the_interface_document(
     assert (table['u_px'][0], table['v_px'][0]) == (0.0, 0.0)
     assert (table['u_px'][24], table['v_px'][24]) == (639.0, 0.0)
     assert (table['u_px'][-1], table['v_px'][-1]) == (639.0, 511.0)
-    status, _, err = starcal(
-        'lookup', tiny_products / 'calibration.json', '-o', tmp_path / 'table.npz', '--points', 3
-    )
+    file, product = tmp_path / 'table.npz', tiny_products / 'calibration.json'
+    status, _, err = starcal('lookup', product, '-o', file, '--points', 3)
     assert (status, err) == (0, '')
-    with np.load(tmp_path / 'table.npz') as archive:
+    with np.load(file) as archive:
         assert list(archive.files) == lookup_columns
         assert sorted(set(archive['u_px'])) == [0, 319.5, 639]
         assert sorted(set(archive['v_px'])) == [0, 255.5, 511]
@@ -79,13 +71,11 @@ def examples() -> list[tuple[str, list[str]]]:
 
 def test_each_command_has_examples_that_it_takes() -> None:
     shown = Counter(name for name, _ in examples())
-    assert all(
-        shown[name] >= 2 for name in ('diagnose', 'calibrate', 'compare', 'simulate', 'play')
-    )
+    often = ('diagnose', 'calibrate', 'compare', 'simulate', 'play')
+    assert all(shown[name] >= 2 for name in often)
     assert set(shown) == {'', *COMMANDS}
-    files = {
-        path.stem.strip('_') for path in (Path(main.__file__).parent / 'commands').glob('*.py')
-    }
+    folder = Path(main.__file__).parent / 'commands'
+    files = {path.stem.strip('_') for path in folder.glob('*.py')}
     assert files == {'init', *COMMANDS}  # a command is one file
     for _, words in examples():
         parser().parse_args(words[1:])  # exits where it does not understand
@@ -172,15 +162,12 @@ def test_a_command_becomes_its_node(starcal, monkeypatch, line, module, argument
     assert '.' not in module or importlib.util.find_spec(module)
 
 
-def test_demo_takes_the_bag_of_the_repository(tmp_path) -> None:
+def test_demo_takes_the_bag_of_the_repository_or_makes_one(tmp_path, monkeypatch) -> None:
     bag = demo.tiny_bag(tmp_path)
     assert bag.bag == TINY
     assert bag.image_count == 10
     assert bag.parameters['camera_info_url'] == f'file://{(TINY / "camera.yaml").resolve()}'
     assert not any(tmp_path.iterdir())
-
-
-def test_demo_makes_the_bag_where_there_is_none(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(demo, '__file__', str(tmp_path / 'package' / 'demo.py'))
     monkeypatch.setenv('AMENT_PREFIX_PATH', '')
     bag = demo.tiny_bag(tmp_path)
@@ -209,15 +196,16 @@ def test_another_error_of_an_import_stays(monkeypatch) -> None:
         main.main(['compare', 'a', 'b'])
 
 
-def test_a_ctrl_c_whose_error_has_lost_its_cause_is_one() -> None:
-    """As NumPy raises it, whose import of its own modules catches ImportError."""
-    code = """
+CTRL_C = """
 import os, signal, sys, time
-from starcal_ground.cli import entry_point
+from pathlib import Path
+from starcal_ground.cli import entry_point, node_processes
 from starcal_ground.cli.commands import diagnose
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
-
+"""
+# As NumPy raises it, whose import of its own modules catches ImportError.
+WITHOUT_CAUSE = """
 def interrupted(_args):
     try:
         os.kill(os.getpid(), signal.SIGINT)
@@ -230,23 +218,23 @@ diagnose.run = interrupted
 sys.argv = ['starcal', 'diagnose', 'x']
 sys.exit(entry_point.main())
 """
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (EXIT_INTERRUPTED, 'starcal: interrupted\n')
-
-
-def test_a_ctrl_c_while_the_player_starts_is_silent() -> None:
-    code = """
-import os, signal
-from pathlib import Path
-from starcal_ground.cli import node_processes
-
-signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
+WHILE_THE_PLAYER_STARTS = """
 become = os.execv
 os.execv = lambda *command: (os.kill(os.getpid(), signal.SIGINT), become(*command))
 node_processes.become('bag_player', node_processes.player_arguments(Path('none'), 1.0), [])
 """
-    done = subprocess.run([sys.executable, '-c', code], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (-signal.SIGINT, '')
+
+
+@pytest.mark.parametrize(
+    ('code', 'expected'),
+    [
+        (WITHOUT_CAUSE, (EXIT_INTERRUPTED, 'starcal: interrupted\n')),
+        (WHILE_THE_PLAYER_STARTS, (-signal.SIGINT, '')),
+    ],
+)
+def test_a_ctrl_c_is_one_line_or_none(code, expected) -> None:
+    done = run_python('-c', CTRL_C + code)
+    assert (done.returncode, done.stderr) == expected
 
 
 def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
@@ -267,13 +255,11 @@ def test_an_interrupt_while_a_node_starts_waits_until_it_is_known() -> None:
 STAMPS_NS = [(1_778_829_600 + 10 * k) * 1_000_000_000 for k in range(12)]
 
 
-def chosen(start: str | None, end: str | None) -> list[int]:
-    after, before = (None if text is None else parse_time(text) for text in (start, end))
-    wanted = Selection(after, before)
-    return [k for k, stamp in enumerate(STAMPS_NS) if wanted(stamp)]
-
-
 def test_between_two_times() -> None:
-    assert chosen('+20', '+50') == [2, 3, 4, 5]
-    assert chosen('1778829680', None) == [8, 9, 10, 11]
-    assert chosen('2026-05-15T07:20:20', '2026-05-15T07:20:40Z') == [2, 3, 4]
+    for start, end, expected in (
+        ('+20', '+50', [2, 3, 4, 5]),
+        ('1778829680', None, [8, 9, 10, 11]),
+        ('2026-05-15T07:20:20', '2026-05-15T07:20:40Z', [2, 3, 4]),
+    ):
+        wanted = Selection(parse_time(start), None if end is None else parse_time(end))
+        assert [k for k, stamp in enumerate(STAMPS_NS) if wanted(stamp)] == expected

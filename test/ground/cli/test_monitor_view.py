@@ -29,13 +29,11 @@ def check(found: float, limit: float, option: str = 'max_x', passed: bool = True
 
 
 def test_nothing_received_is_said() -> None:
-    text = shown(Received())
+    why_none = 'calibration 1 is not active, the gate refuses it now'
+    text, why = shown(Received()), shown(Received(why_none=why_none))
     for words in ('no image since', 'no status received', 'none active', 'no diagnostics'):
         assert words in text
-    why_none = 'calibration 1 is not active, the gate refuses it now'
-    assert f'none active: the prior is in use: {why_none}'[:60] in shown(
-        Received(why_none=why_none)
-    )
+    assert f'none active: the prior is in use: {why_none}'[:60] in why
 
 
 @pytest.mark.parametrize(
@@ -54,7 +52,9 @@ def test_nodes_in_another_namespace_are_named(namespace, nodes, remedy) -> None:
     assert (asked in text) == bool(remedy) and ('no status received' in text) != bool(remedy)
 
 
-def test_images_are_counted_by_reason() -> None:
+def test_images_are_counted_by_reason_and_cell() -> None:
+    coverage = coverage_text(np.array([[0, 1], [3, 4]])).plain.splitlines()
+    assert coverage == ['most in a cell: 4', '··░░', '▓▓██']
     received = Received()
     for refusal in ('', 'no_match', '', 'no_match', 'frozen'):
         one = refused_image(1_700_000_000_000_000_000, 640, 512, refusal, 'of a detail')
@@ -114,11 +114,6 @@ def test_a_refused_candidate_shows_the_failed_check_first() -> None:
 )
 def test_the_share_of_a_limit(found, limit, option, share) -> None:
     assert share_of_limit(check(found, limit, option)) == share
-
-
-def test_coverage_is_a_picture_of_the_detector() -> None:
-    text = coverage_text(np.array([[0, 1], [3, 4]])).plain.splitlines()
-    assert text == ['most in a cell: 4', '··░░', '▓▓██']
 
 
 def test_health_and_gate_come_first_on_a_terminal_of_24_lines_and_80_columns() -> None:

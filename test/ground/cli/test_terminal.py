@@ -49,14 +49,11 @@ def on_terminal(**environment: str) -> str:
 COLOUR = re.compile(r'\x1b\[(?:\d+;)*3[0-7]m')
 
 
-def test_a_terminal_shows_bar_table_and_colour() -> None:
+def test_a_terminal_shows_bar_table_and_colour_but_for_no_color() -> None:
     said = on_terminal()
     assert '3/3' in said and 'images' in said
     assert 'fx [px]' in said and '─' in said  # brackets are no markup
     assert COLOUR.search(said.partition('fx')[2])
-
-
-def test_no_color_is_obeyed() -> None:
     said = on_terminal(NO_COLOR='1')
     assert 'refused' in said and not COLOUR.search(said)
 
@@ -70,8 +67,6 @@ def test_a_pipe_shows_plain_lines_and_no_bar(capsys) -> None:
     out, err = capsys.readouterr()
     assert err == ''
     assert out == 'name    value\nfx    1801.03\nskew        0\naccepted\n'
-
-
-def test_columns_are_as_wide_as_their_widest_cell() -> None:
+    # Columns are as wide as their widest cell.
     lines = table_lines(('a', 'b', 'c'), [('long name', 'x', '1'), ('n', 'word', '10')], left=2)
     assert lines == ['a          b      c', 'long name  x      1', 'n          word  10']

@@ -71,8 +71,6 @@ PLACES = {
 }
 """Where the file is, if the command does not name it; in `MAY_LACK` it may be missing."""
 MAY_LACK = ('file of a bag', 'residuals.npz', 'observations.mcap', '--params of trend')
-
-
 CASES = [
     (name, kind)
     for name in FILES

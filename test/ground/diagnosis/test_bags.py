@@ -4,26 +4,16 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
+from mission_files import images, TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 
-from starcal_ground.bags import reader
 from starcal_ground.diagnosis.attitude_readings import wire_attitudes
 from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ground.ros.setup_finder import Unmatched
-from starcal_ros.pipeline.setup import load_setup, Setup
-from starcal_ros.records import Image
+from starcal_ros.pipeline.setup import load_setup
 from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
-
-TINY = Path(__file__).parents[3] / 'bags' / 'tiny'
-
-
-@pytest.fixture(scope='module')
-def unaligned() -> Setup:
-    """The set-up of the tiny bag without a prior alignment or a star tracker sigma."""
-    return load_setup({'camera_info_url': str(TINY / 'camera.yaml')})
 
 
 def test_two_images_are_too_few_for_an_alignment() -> None:
@@ -45,24 +35,20 @@ def test_the_valid_attitudes_are_looked_at_as_they_were_received(direction) -> N
 
 
 @pytest.mark.slow
-def test_a_process_of_its_own(unaligned, tmp_path, monkeypatch) -> None:
+def test_a_process_of_its_own(tmp_path, monkeypatch) -> None:
     # In the folder of an untrusted bag: nothing that lies there is imported.
     (tmp_path / 'cv2.py').write_text('raise SystemExit(9)')
     monkeypatch.chdir(tmp_path)
-    images = reader.read_images([TINY], '/opnav/image_raw', 0.0)
-    three = tuple(i for _, i in zip(range(3), images, strict=False) if isinstance(i, Image))
-    attitude = dataclasses.replace(unaligned.attitude, attitude_direction='inertial_to_st')
     answers: list[Diagnosis] = []
-    unmatched = Unmatched(
-        dataclasses.replace(unaligned, attitude=attitude), AttitudeHistory(), answers.append
-    )
-    for image in three:
+    stated = {'camera_info_url': str(TINY / 'camera.yaml'), 'attitude_direction': 'inertial_to_st'}
+    unmatched = Unmatched(load_setup(stated), AttitudeHistory(), answers.append)
+    for image in images()[:3]:
         unmatched.add(image)
     assert unmatched._thread is not None
     unmatched._thread.join()
     assert [found.cause for found in answers] == ['no_attitude']
     assert answers[0].evidence[0].startswith('3 of 3 images identified without attitude')
     unmatched.close()
-    unmatched.add(three[0])
+    unmatched.add(images()[0])
     unmatched._thread.join()
     assert len(answers) == 1

@@ -182,9 +182,8 @@ def unaligned(night: Night) -> Night:
     return with_setup(night, is_aligned=False)
 
 
-def with_direction(direction: str) -> Change:
-    options = AttitudeOptions(attitude_direction=direction)
-    return lambda night: with_setup(night, attitude=options)
+def inverse_direction(night: Night) -> Night:
+    return with_setup(night, attitude=AttitudeOptions(attitude_direction='inertial_to_st'))
 
 
 def off(degrees: float) -> Change:
@@ -385,7 +384,7 @@ def expanded(pixels: Any) -> Any:
         ([], ['none'], None, ''),
         ([w_first], ['quaternion_order'], 'wxyz', ''),
         ([conjugated], ['attitude_direction'], 'inertial_to_st', 'on: inertial_to_st'),
-        ([with_direction('inertial_to_st')], ['attitude_direction'], 'st_to_inertial', ''),
+        ([inverse_direction], ['attitude_direction'], 'st_to_inertial', ''),
         ([rolled(-90.0)], ['rotated'], 90.0, ''),
         ([mirrored], ['mirrored'], 'left to right', ''),
         ([of_pixels(lambda p: p[::-1])], ['mirrored'], 'top to bottom', ''),
@@ -643,9 +642,7 @@ def test_a_clock_of_another_scale_or_zone(late_s, words, catalog) -> None:
         ((1024, 1280), ['the focal length in their pixels']),
     ],
 )
-def test_a_size_without_known_stars_has_the_remedies_of_all_that_it_can_be(
-    shape, remedies
-) -> None:
+def test_a_size_without_known_stars_has_the_remedies_of_all_it_can_be(shape, remedies) -> None:
     setup = read_setup(Path(__file__).parents[3] / 'bags' / 'tiny' / 'params.yaml')
     pixels = np.random.default_rng(0).integers(90, 110, shape, np.uint16)
     found = diagnose([Image(k, pixels) for k in range(3)], NO_ATTITUDES, setup)

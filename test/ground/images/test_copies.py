@@ -64,7 +64,6 @@ def jpeg(pixels: Pixels, quality: int) -> Pixels:
 
 
 def words_on(frames: list[Pixels]) -> dict[int, str]:
-    """Words on the copies among frames, by their number."""
     _, _, copies = _sources(Image((k + 1) * S, one) for k, one in enumerate(frames))
     return {time_ns // S - 1: words for time_ns, words in copies.items()}
 

@@ -176,15 +176,12 @@ SCALES: Mapping[str, tuple[tuple[str, ...], tuple[float, ...]]] = {
 
 
 @pytest.mark.parametrize('name', SCALES)
-def test_the_focal_lengths_that_a_header_states(name, tmp_path) -> None:
+def test_the_instrument_and_the_focal_lengths_that_a_header_states(name, tmp_path) -> None:
     cards, expected_px = SCALES[name]
-    one = look_at(file_of(tmp_path, START, EIGHT, *cards))
+    one = look_at(file_of(tmp_path, START, EIGHT, *cards, "INSTRUME= 'ASI'"))
+    assert one.camera == 'ASI'
     for found in (one.focal_lengths, focal_lengths_of([one, one])):
         assert [f.focal_px for f in found] == pytest.approx(list(expected_px), rel=1e-4)
-
-
-def test_the_instrument_is_the_camera(tmp_path) -> None:
-    assert look_at(file_of(tmp_path, START, EIGHT, "INSTRUME= 'ASI'")).camera == 'ASI'
 
 
 SITES: Mapping[str, tuple[tuple[str, ...], tuple[float, float, float] | None]] = {
@@ -353,9 +350,8 @@ def test_deep_files_with_a_date_go_before_more_previews(tmp_path) -> None:
 
 def test_the_deepest_file_of_one_exposure_comes_first(tmp_path) -> None:
     (tmp_path / 'deep.fits.gz').write_bytes(gzip.compress(unit(PIXELS, [START, EIGHT])))
-    eight = fits.PrimaryHDU(PIXELS.astype(np.uint8), fits.Header({'EXPTIME': 8.0}))
-    eight.header['DATE-OBS'] = '2024-03-09T22:10:00'
-    eight.writeto(tmp_path / 'preview.fits')
+    header = fits.Header({'EXPTIME': 8.0, 'DATE-OBS': '2024-03-09T22:10:00'})
+    fits.PrimaryHDU(PIXELS.astype(np.uint8), header).writeto(tmp_path / 'preview.fits')
     chosen, _ = photographs_of([tmp_path])
     assert [one.path.name for one in chosen] == ['deep.fits.gz', 'preview.fits']
 

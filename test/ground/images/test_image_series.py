@@ -30,7 +30,7 @@ def read(path: Path, options: ImageOptions = PLAIN) -> np.ndarray:
     return np.asarray(pixels_of(path, options, common_scale([look(path, options)], options)))
 
 
-def test_floating_point_is_mapped_to_16_bit_by_a_scale_that_is_known(tmp_path) -> None:
+def test_floating_point_is_mapped_to_16_bit_by_a_known_scale_or_range(tmp_path) -> None:
     path = write_fits(tmp_path / 'a.fits', IMAGE, 'float32')
     scale = common_scale([look(path, PLAIN)], PLAIN)
     pixels = read(path)
@@ -38,33 +38,25 @@ def test_floating_point_is_mapped_to_16_bit_by_a_scale_that_is_known(tmp_path) -
     assert pixels.dtype == np.uint16 and 0 < pixels.max() <= 65000
     back = pixels * scale.step + scale.offset
     assert np.abs(back - values).max() <= scale.step * 0.5001  # rounding to whole numbers
+    options = ImageOptions(value_range=(0.0, 650.0))
+    pixels = read(path, options)
+    expected = np.clip(np.rint(values / 0.01), 0, 65535)
+    assert np.abs(pixels - expected).max() <= 1  # float32 of 650 resolves 6e-5, 0.01 of a step
 
 
-def test_negative_whole_numbers_are_shifted_without_loss(tmp_path) -> None:
-    path = tmp_path / 'a.fits'
+def test_negative_numbers_are_shifted_without_loss_and_none_becomes_the_median(tmp_path) -> None:
+    header = fits.Header({'DATE-AVG': date(IMAGE.time_ns)})
+    path, none = tmp_path / 'a.fits', tmp_path / 'b.fits'
     values = IMAGE.pixels.astype(np.int32) - 1000
-    fits.PrimaryHDU(values, fits.Header({'DATE-AVG': date(IMAGE.time_ns)})).writeto(path)
+    fits.PrimaryHDU(values, header).writeto(path)
     scale = common_scale([look(path, PLAIN)], PLAIN)
     assert (scale.offset, scale.step) == (values.min(), 1.0)
     assert (read(path) + scale.offset == values).all()
-
-
-def test_not_a_number_becomes_the_median(tmp_path) -> None:
-    path = tmp_path / 'a.fits'
-    values = IMAGE.pixels.astype('f4')
-    values[3, 5] = np.nan
-    fits.PrimaryHDU(values, fits.Header({'DATE-AVG': date(IMAGE.time_ns)})).writeto(path)
-    pixels = read(path)
+    with_nan = IMAGE.pixels.astype('f4')
+    with_nan[3, 5] = np.nan
+    fits.PrimaryHDU(with_nan, header).writeto(none)
+    pixels = read(none)
     assert abs(int(pixels[3, 5]) - int(np.median(pixels))) <= 1
-
-
-def test_a_range_clips(tmp_path) -> None:
-    path = write_fits(tmp_path / 'a.fits', IMAGE, 'float32')
-    options = ImageOptions(value_range=(0.0, 650.0))
-    pixels = read(path, options)
-    values = IMAGE.pixels.astype('f4') * 2.5 - 100.0
-    expected = np.clip(np.rint(values / 0.01), 0, 65535)
-    assert np.abs(pixels - expected).max() <= 1  # float32 of 650 resolves 6e-5, 0.01 of a step
 
 
 @pytest.mark.parametrize('ending', ['.png', '.tiff'])
@@ -175,18 +167,14 @@ def test_a_cube_is_no_colour_image(tmp_path, shape) -> None:
             look(path, ImageOptions(channel=channel))
 
 
-def test_a_time_key_is_taken_as_the_middle(tmp_path) -> None:
-    path = write_fits(tmp_path / 'a.fits', IMAGE, **{'DATE-OBS': MIDDLE, 'EXPTIME': 9.0})
-    assert look(path, ImageOptions(time_key='DATE-OBS')).time_ns % 10**9 == 500_000_000
+def test_keys_of_time_as_the_middle_and_of_temperature_are_stated(tmp_path) -> None:
+    header = {'DATE-OBS': MIDDLE, 'EXPTIME': 9.0, 'CCD-TEMP': -21.5, 'SATURATE': 60000}
+    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
+    found = look(path, ImageOptions(time_key='DATE-OBS', temperature_key='CCD-TEMP'))
+    assert found.time_ns % 10**9 == 500_000_000
+    assert (found.temperature_degc, found.saturation) == (-21.5, 60000.0)
     with pytest.raises(IngestError, match='no keyword T0'):
         look(path, ImageOptions(time_key='T0'))
-
-
-def test_temperature_and_saturation_come_from_the_header(tmp_path) -> None:
-    header = {'DATE-AVG': MIDDLE, 'CCD-TEMP': -21.5, 'SATURATE': 60000}
-    path = write_fits(tmp_path / 'a.fits', IMAGE, **header)
-    found = look(path, ImageOptions(temperature_key='CCD-TEMP'))
-    assert (found.temperature_degc, found.saturation) == (-21.5, 60000.0)
 
 
 def test_a_tiled_image_that_claims_gigabytes_is_not_decoded(tmp_path) -> None:

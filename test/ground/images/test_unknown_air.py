@@ -138,30 +138,23 @@ def test_a_clock_wrong_by_an_hour_is_named_and_a_minute_is_in_the_sigma() -> Non
         off = [off_sigma(each) for each in found]
         if is_right:
             assert max(off) < LIMIT_SIGMA
-            errors = [honesty(GIVEN, each, unmoved)[0] for each in found]
+            errors = [honesty(GIVEN, each, np.zeros_like)[0] for each in found]
             assert np.sqrt(np.mean(np.square(errors))) < HONEST
         else:
             assert min(off) > LIMIT_SIGMA
 
 
-def test_a_clock_is_named_in_minutes_to_add_to_the_stamps() -> None:
+def test_a_clock_is_named_in_minutes_also_beside_an_image_without_a_zenith() -> None:
     clock = numbers_of_site(estimate(from_the_stated_site(1, 1200)))['clock_offset_min']
     # Its 1-sigma is 3.7 minutes, of which the prior takes 5 %.
     assert abs(clock.estimated - 20.0) < 2.0 * clock.sigma < 8.0
-
-
-def test_an_image_without_a_zenith_leaves_the_others_theirs() -> None:
-    """Recordings of early versions have none; a wrong clock of the others is named."""
+    # Recordings of early versions have no zenith; a wrong clock of the others is named.
     images = from_the_stated_site(1, 3600)
     unknown = dataclasses.replace(
         images[3], zenith_icrf=np.full(3, np.nan), refraction_arcsec=np.zeros(2)
     )
     found = estimate([*images[:3], unknown, *images[4:]])
     assert off_sigma(found) > LIMIT_SIGMA
-
-
-def unmoved(pixels: Floats) -> Floats:
-    return np.zeros_like(pixels)
 
 
 @pytest.mark.slow
@@ -173,7 +166,7 @@ def test_the_ground_is_found_with_its_latitude_and_an_honest_sigma(wrong_clock) 
         assert text.startswith('observer: ground: ')
         declination = math.degrees(math.asin(images[0].zenith_icrf[2]))
         assert abs(declination - SITE.latitude_deg) < 8.0
-        errors.append(honesty(GIVEN, estimate(images), unmoved)[0])
+        errors.append(honesty(GIVEN, estimate(images), np.zeros_like)[0])
     assert np.sqrt(np.mean(np.square(errors))) < HONEST
 
 
@@ -198,7 +191,7 @@ def test_on_a_stated_ground_the_likeliest_zenith_is_taken_with_an_honest_sigma()
         images = noisy(seen_from(SITE, seed, wrong_clock=True)[:4], seed)
         (_, alone), (stated, text) = (with_air(images, CAMERA, is_it) for is_it in (False, True))
         assert 'a zenith at' in text
-        found.append((alone, *honesty(GIVEN, estimate(stated), unmoved)))
+        found.append((alone, *honesty(GIVEN, estimate(stated), np.zeros_like)))
     told, errors, _ = zip(*found, strict=True)
     assert any(text.startswith('observer: ground or space') for text in told)
     assert np.sqrt(np.mean(np.square(errors))) < HONEST
@@ -232,7 +225,7 @@ def test_a_camera_with_attitudes_on_the_ground_needs_no_site(tmp_path) -> None:
         made = calibrate(observe(chosen(source)))
         assert made.calibration.accepted, made.calibration.reasons
         assert made.notes[0].startswith('observer: ground: the stars show refraction')
-        errors.append(honesty(GIVEN, made.calibration, unmoved)[0])
+        errors.append(honesty(GIVEN, made.calibration, np.zeros_like)[0])
     assert np.sqrt(np.mean(np.square(errors))) < HONEST
 
 
@@ -241,7 +234,7 @@ def test_in_space_no_ground_is_found_and_the_sigma_is_honest() -> None:
     for seed in range(2):
         images, text = with_air(seen_from(SiteOptions(), seed), CAMERA)
         assert not text.startswith('observer: ground: ')
-        assert honesty(GIVEN, estimate(images), unmoved)[0] < 2.0
+        assert honesty(GIVEN, estimate(images), np.zeros_like)[0] < 2.0
 
 
 def test_an_image_of_another_shape_is_refused() -> None:
@@ -295,11 +288,9 @@ def test_derivatives_of_refraction_are_those_of_differences() -> None:
     moved = refracted(e, zenith[1], 55.0) - refracted(e, zenith[1], 54.0)
     assert np.abs(size - moved).max() < 0.01 * np.abs(moved).max()
     assert (turns[:, 1] == 0).all()
-
-
-def test_one_clock_has_one_time() -> None:
+    # One clock has one time.
     stamps = np.arange(5, dtype=np.int64) * 10**12
-    times: Floats = np.asarray(1.0 + 7.292115e-14 * stamps, np.float64)
+    times = np.asarray(1.0 + 7.292115e-14 * stamps, np.float64)
     zenith = zenith_of(0.3, times)
     assert Refraction(stamps, zenith, 54.0, 6.0).labels == ('latitude_rad', 'sidereal_time_1_rad')
 

@@ -83,19 +83,13 @@ def test_the_scale_is_that_of_the_arrows() -> None:
     assert lengths[svg.SERIES[0]] == pytest.approx(1.5 * lengths[svg.SERIES[1]], abs=0.2)
 
 
-def test_a_field_that_no_image_shows_is_not_drawn() -> None:
-    drawn = detector_figures.field_vectors(half_wave_along_u(6e-4), CAMERA)
-    assert '>less than 0.001 px everywhere<' in drawn.svg.body and 'scale' not in drawn.svg.body
-
-
-def test_no_displacement_is_said() -> None:
+def test_what_no_image_shows_and_a_flat_map_say_so_and_others_start_at_zero() -> None:
+    drawn = detector_figures.field_vectors(half_wave_along_u(6e-4), CAMERA).svg.body
+    assert '>less than 0.001 px everywhere<' in drawn and 'scale' not in drawn
     ideal = CAMERA.replace(k1=0.0)
     assert '>no displacement<' in detector_figures.distortion_vectors(ideal).svg.body
     nothing = detector_figures.detector_map(np.zeros((3, 3)), ideal, ' px')
     assert '>0 px everywhere<' in nothing.body
-
-
-def test_a_flat_map_says_so_and_others_start_at_zero() -> None:
     flat = np.full((25, 25), 5.774)
     flat[0, 0] = 5.802
     assert '>flat within 0.48 %<' in detector_figures.detector_map(flat, CAMERA, '″').body

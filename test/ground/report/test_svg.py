@@ -36,16 +36,14 @@ def test_ticks_are_inside_and_not_too_many(low, width, most) -> None:
     assert low - slack <= ticks[0] and ticks[-1] <= low + width + slack
 
 
-def test_a_logarithmic_scale() -> None:
+def test_a_logarithmic_scale_and_its_numbers() -> None:
+    """Numbers are short and have a minus sign."""
+    assert [in_digits(x) for x in (-0.25, 1e-17, 1200.0)] == ['\N{MINUS SIGN}0.25', '0', '1200']
     scale = Scale(0.01, 100.0, 0.0, 400.0, is_log=True)
     assert scale.ticks(6) == pytest.approx([0.01, 0.1, 1.0, 10.0, 100.0])
     assert scale(np.array([0.01, 1.0, 100.0])).tolist() == pytest.approx([0.0, 200.0, 400.0])
     near = Scale(0.3, 4.0, 0.0, 1.0, is_log=True)
     assert near.ticks(6) == pytest.approx([0.5, 1.0, 2.0])
-
-
-def test_numbers_are_short_and_have_a_minus_sign() -> None:
-    assert [in_digits(x) for x in (-0.25, 1e-17, 1200.0)] == ['\N{MINUS SIGN}0.25', '0', '1200']
 
 
 def test_marks_stand_at_their_values_and_text_is_escaped() -> None:
@@ -89,7 +87,6 @@ def test_an_arrow_ends_where_it_points() -> None:
 
 
 def places(drawn: svg.Drawing) -> np.ndarray:
-    """Places (n, 2) of the marks of a plot."""
     found = re.findall(r'translate\(([\d.-]+) ([\d.-]+)\)', drawn.body)
     return np.array(found, np.float64)
 
@@ -108,7 +105,10 @@ def test_the_axes_hold_all_values_below_the_legend(values, log) -> None:
     assert (v > in_legend[1]).all()
 
 
-def test_an_axis_has_the_ends_and_names_that_are_given() -> None:
+def test_an_axis_has_the_ends_and_names_that_are_given_also_without_a_number() -> None:
+    empty = Curve([1.0, 2.0], [np.nan, -1.0], mark='circle', sigma=np.array([np.nan, 1.0]))
+    drawn = plot([empty], 'x', 'y', log='y')
+    assert 'nan' not in drawn.body and 'inf' not in drawn.body
     curve = Curve([0.0, 1.0, 2.0], [1.0, 3.0, np.nan], mark='circle')
     long = [(float(k), f'a long name, indeed {k}') for k in range(3)]
     drawn = plot([curve], '', 'y (px)', x=(-1.0, 3.0), y=(0.0, 4.0), x_ticks=long)
@@ -117,9 +117,3 @@ def test_an_axis_has_the_ends_and_names_that_are_given() -> None:
     bottom, top = 290.0, 10.0
     assert [v0, v1] == pytest.approx([bottom - (bottom - top) * k / 4 for k in (1, 3)])
     assert 468.0 - u1 == pytest.approx(2 * (u1 - u0), abs=0.2)
-
-
-def test_nothing_finite_is_drawn_as_empty_axes() -> None:
-    empty = Curve([1.0, 2.0], [np.nan, -1.0], mark='circle', sigma=np.array([np.nan, 1.0]))
-    drawn = plot([empty], 'x', 'y', log='y')
-    assert 'nan' not in drawn.body and 'inf' not in drawn.body

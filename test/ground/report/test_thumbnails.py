@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 
 import cv2
@@ -22,24 +21,20 @@ PIXELS = RNG.poisson(40, (512, 640)).astype(np.uint8)
 PIXELS[100, 200] = 255
 
 
-def observed(time_ns: int, refusal: str = '') -> StarObservations:
-    """An image without stars used and with one left out."""
-    return StarObservations.of_image(
-        time_ns,
-        (640, 512),
-        refusal=refusal,
-        refused_stars={'saturated': 1},
-        refused_catalog_id=np.array([7]),
-        refused_px=np.array([[200.0, 100.0]], np.float32),
-        refused_reason=np.array([0], np.uint8),
-    )
-
-
 def album_of(count: int, refused_every: int) -> Album:
+    """Images without stars used and with one left out."""
     album = Album()
     for k in range(count):
-        refusal = 'no_stars' if k % refused_every == 0 else ''
-        album.show(Image(k, PIXELS), observed(k, refusal), GEOMETRY)
+        seen = StarObservations.of_image(
+            k,
+            (640, 512),
+            refusal='no_stars' if k % refused_every == 0 else '',
+            refused_stars={'saturated': 1},
+            refused_catalog_id=np.array([7]),
+            refused_px=np.array([[200.0, 100.0]], np.float32),
+            refused_reason=np.array([0], np.uint8),
+        )
+        album.show(Image(k, PIXELS), seen, GEOMETRY)
     return album
 
 
@@ -63,16 +58,11 @@ def test_a_large_image_is_reduced_before_it_is_drawn() -> None:
     camera = CameraModel(2592, 2048, np.array([7e3, 0, 7e3, 1295.5, 1023.5, 0, 0, 0, 0, 0]))
     geometry = CameraGeometry(camera, np.array([0.0, 0, 0, 1]))
     place = np.array([[1944.0, 512.0]])
-    record = dataclasses.replace(
-        StarObservations.of_image(1, (2592, 2048)),
-        catalog_id=np.array([1]),
-        direction_icrf=line_of_sight(camera, place),
-        magnitude=np.zeros(1, np.float32),
-        measured_px=place,
-        covariance_px2=np.ones((1, 3)),
-        flux_dn=np.ones(1, np.float32),
-        snr=np.ones(1, np.float32),
-    )
+    one = np.ones(1, np.float32)
+    record = StarObservations.of_image(
+        *(1, (2592, 2048)), catalog_id=np.array([1]), direction_icrf=line_of_sight(camera, place),
+        measured_px=place, covariance_px2=np.ones((1, 3)), magnitude=one, flux_dn=one, snr=one,
+    )  # fmt: skip
     album = Album()
     album.show(Image(1, large), record, geometry)
     (thumbnail,) = album.thumbnails()

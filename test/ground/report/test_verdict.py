@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from starcal_ground.report import verdict
-from starcal_ros.formats.products.product_files import read_calibration
 from starcal_ros.records import GateCheck, SigmaPart, TemperatureTerms
 
 GATE = (
@@ -28,9 +27,7 @@ def test_checks_that_were_not_made_did_not_pass() -> None:
     assert verdict.checks_sentence(GATE) == sentence
     assert verdict.checks_sentence(GATE[:1]) == 'Checks: 1 passed.'
     assert verdict.checks_sentence(()) == ''
-
-
-def test_failed_checks_come_first_and_sigmas_have_one_name() -> None:
+    # Failed checks come first, and sigmas have one name.
     rows = verdict.check_rows(GATE)
     names = ['coverage', 'residual', 'step', 'turn', 'distance of cx']
     assert [check.name for check, *_ in rows] == names
@@ -38,9 +35,8 @@ def test_failed_checks_come_first_and_sigmas_have_one_name() -> None:
     assert rows[-1][1:] == ('passed', '0.0 sigma', 'at most 5 sigma', '')
 
 
-def test_the_precision_is_that_of_map_and_budget(tiny_products) -> None:
-    calibration = read_calibration(tiny_products / 'calibration.json')
-    assert calibration.maps is not None
+def test_the_precision_is_that_of_map_and_budget(tiny) -> None:
+    assert tiny.maps is not None
     sigma = np.full((10, 10), 0.2)
     sigma[0, :2] = 9.0
     budget = (
@@ -51,9 +47,9 @@ def test_the_precision_is_that_of_map_and_budget(tiny_products) -> None:
         SigmaPart('star tracker noise', 0.0, 7.9, ''),
     )
     shown = dataclasses.replace(
-        calibration,
+        tiny,
         sigma_budget=budget,
-        maps=dataclasses.replace(calibration.maps, shape_sigma_arcsec=sigma),
+        maps=dataclasses.replace(tiny.maps, shape_sigma_arcsec=sigma),
     )
     assert verdict.precision_sentences(shown)[0] == (
         'Camera alone: the 1-sigma of a line of sight is 0.25″ rms over the detector, at most '
@@ -84,22 +80,19 @@ MEND = (
         (('min_images',), 'met', MEND),
     ],
 )
-def test_the_next_step_is_the_remedy_of_the_requirement_that_is_missed(
-    tiny_products, failed, note, step
-) -> None:
+def test_the_next_step_is_the_remedy_of_a_missed_requirement(tiny, failed, note, step) -> None:
     """A sound calibration gets the statement that lowers a sigma most, or nothing."""
-    calibration = read_calibration(tiny_products / 'calibration.json')
-    assert calibration.statements[0].option == 'star_tracker_slow_arcsec'
+    assert tiny.statements[0].option == 'star_tracker_slow_arcsec'
     gate = tuple(
         dataclasses.replace(
             check,
             passed=check.passed and check.option not in failed,
             note=note if check.option == 'requirements' else check.note,
         )
-        for check in calibration.gate
+        for check in tiny.gate
     )
-    judged = dataclasses.replace(calibration, accepted=not failed, gate=gate)
-    assert verdict.next_step(judged) == step.format(statement=calibration.statements[0])
+    judged = dataclasses.replace(tiny, accepted=not failed, gate=gate)
+    assert verdict.next_step(judged) == step.format(statement=tiny.statements[0])
     if not failed:
         assert verdict.next_step(dataclasses.replace(judged, statements=())) == ''
 
@@ -112,19 +105,18 @@ def test_the_next_step_is_the_remedy_of_the_requirement_that_is_missed(
     ],
 )
 def test_a_length_that_no_image_shows_has_no_digits(
-    tiny_products, worst_px, variation_px, field, varies
+    tiny, worst_px, variation_px, field, varies
 ) -> None:
-    calibration = read_calibration(tiny_products / 'calibration.json')
-    assert calibration.model_checks is not None
+    assert tiny.model_checks is not None
     checks = dataclasses.replace(
-        calibration.model_checks,
+        tiny.model_checks,
         field_rms_px=0.25,
         field_worst_px=worst_px,
         image_variation_px=variation_px,
     )
-    first_ns = calibration.time_ns - 540 * 10**9
+    first_ns = tiny.time_ns - 540 * 10**9
     shown = dataclasses.replace(
-        calibration, model_checks=checks, zero_skew_cost_px=0.5, first_image_ns=first_ns
+        tiny, model_checks=checks, zero_skew_cost_px=0.5, first_image_ns=first_ns
     )
     mean = 'the calibration is that of the mean over the 9 minutes of the images'
     assert verdict.model_sentences(shown) == [
@@ -137,9 +129,8 @@ def test_a_length_that_no_image_shows_has_no_digits(
 
 
 def test_the_summary_is_a_line() -> None:
-    terms = TemperatureTerms(
-        20.0, (4e-5,), (1e-6,), (1e-5, 0.0, 0.0), (1e-6,) * 3, 'left out: this'
-    )
+    turns = ((1e-5, 0.0, 0.0), (1e-6,) * 3)
+    terms = TemperatureTerms(20.0, (4e-5,), (1e-6,), *turns, 'left out: this')
     assert verdict.thermal_summary(terms) == (
         'a1 +0.0000400 (0.000001) /degC; alignment +2.063 (0.21), +0.000 (0.21), +0.000 (0.21) '
         'arcsec/degC; reference 20 degC; left out: this'

@@ -18,7 +18,7 @@ from starcal_ros.sky.catalog import BUNDLED_MAGNITUDE, cone, load_catalog
 AXIS = erfa.s2c(1.0, -0.9)
 
 
-def test_the_sky_has_the_mean_density_and_the_bundled_stars() -> None:
+def test_the_sky_has_the_mean_density_and_the_bundled_stars_and_a_disc_is_even() -> None:
     sky = deep_sky(AXIS, math.radians(3.0), 13.0, np.random.default_rng(2), spread=0.0)
     assert (np.diff(sky.magnitude) >= 0).all()
     assert len(sky.select(sky.magnitude < BUNDLED_MAGNITUDE)) == len(load_catalog())
@@ -26,9 +26,7 @@ def test_the_sky_has_the_mean_density_and_the_bundled_stars() -> None:
     expected = 28.26 * np.diff(10 ** log10_density(np.array([BUNDLED_MAGNITUDE, 13.0])))
     assert len(faint) == pytest.approx(expected[0], rel=0.05)  # 5 sigma of 2,700 stars
     assert len(cone(sky, AXIS, math.radians(3.0))) >= len(faint)
-
-
-def test_a_disc_is_even() -> None:
+    # A disc is even.
     direction = disc(AXIS, 10_000, 0.5, np.random.default_rng(1))
     inside = np.count_nonzero(direction @ AXIS > math.cos(0.25)) / 10_000
     assert inside == pytest.approx((1 - math.cos(0.25)) / (1 - math.cos(0.5)), abs=0.02)

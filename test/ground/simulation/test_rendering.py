@@ -38,19 +38,16 @@ def test_a_star_has_its_flux_at_its_place(sigma_px) -> None:
         assert abs((near * v).sum() / near.sum() - v0) < 1.01 * alias_px + 1e-7
 
 
-def test_a_pixel_holds_the_integral_of_the_gaussian() -> None:
+def test_a_pixel_holds_the_integral_of_the_gaussian_which_the_border_cuts() -> None:
     image = star_electrons(np.array([[10.3, 9.6]]), np.array([1.0]), 0.95, (20, 20))
     fine = (np.arange(-500, 500) + 0.5) / 1000
     along_u = np.exp(-((11 + fine - 10.3) ** 2) / (2 * 0.95**2))
     along_v = np.exp(-((8 + fine - 9.6) ** 2) / (2 * 0.95**2))
     expected = along_u.mean() * along_v.mean() / (2 * math.pi * 0.95**2)
     assert image[8, 11] == pytest.approx(expected, rel=1e-6)  # midpoint rule with 1e-3 px steps
-
-
-def test_light_of_stars_at_the_border_is_cut_there() -> None:
+    # A star on the outer edge of the border pixels leaves one half inside.
     pixels = np.array([[-0.5, 10.0], [30.0, 19.5], [-50.0, -50.0]])
     image = star_electrons(pixels, np.array([1000.0, 500.0, 1e6]), 1.0, (20, 40))
-    # A star on the outer edge of the border pixels leaves one half inside.
     assert image.sum() == pytest.approx(500 + 250, rel=1e-8)
 
 
@@ -82,14 +79,12 @@ def test_hot_pixels_stay_where_they_are() -> None:
     hot = pattern > tiny.detector.background_electrons
     assert hot.sum() == round(tiny.detector.hot_fraction * pattern.size)
     assert np.array_equal(pattern, fixed_pattern(tiny))
-    first, second = (render(tiny, scene(tiny, index), index, pattern).pixels for index in (0, 1))
     hottest = pattern > 1000
-    expected_dn = (
-        tiny.detector.offset_dn + pattern[hottest].mean() / tiny.detector.electrons_per_dn
-    )
-    for pixels in (first, second):
+    expected = tiny.detector.offset_dn + pattern[hottest].mean() / tiny.detector.electrons_per_dn
+    for index in (0, 1):
+        pixels = render(tiny, scene(tiny, index), index, pattern).pixels
         # Photon noise of a kilo-electron and 8 e- reading over some ten pixels: 2 per cent.
-        assert pixels[hottest].mean() == pytest.approx(expected_dn, rel=0.1)
+        assert pixels[hottest].mean() == pytest.approx(expected, rel=0.1)
 
 
 def test_cosmic_rays_leave_tracks() -> None:

@@ -34,16 +34,15 @@ def test_export_writes_kernels_that_load(folder, tmp_path, starcal) -> None:
     spiceypy.kclear()
 
 
-def test_export_states_the_cost_of_each_part(folder, tmp_path, starcal) -> None:
-    lines = starcal('export', folder, '--to', 'opencv', '-o', tmp_path).out.splitlines()
-    assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')
-
-
 @pytest.mark.parametrize('accepted', [True, False])
-def test_export_warns_of_a_refused_calibration(folder, tmp_path, starcal, accepted) -> None:
+def test_export_states_the_cost_of_each_part_and_a_refusal_by_the_gate(
+    folder, tmp_path, starcal, accepted
+) -> None:
     reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
     judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
     write_calibration(judged, folder / 'calibration.json')
     answer = starcal('export', folder, '--to', 'opencv', '-o', tmp_path)
     expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
     assert (answer.status, answer.err.splitlines()) == (0, expected)
+    lines = answer.out.splitlines()
+    assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')

@@ -1,5 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""A mistake of the set-up is named with its remedy by `calibrate` and `diagnose`."""
+"""A mistake of the set-up is named with its remedy by `calibrate` and `diagnose`, and no other."""
 
 from __future__ import annotations
 
@@ -25,6 +25,7 @@ from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
 IMAGES = 4
+REAL_SKY = Path(__file__).parents[5] / 'shared' / 'realsky'
 
 Write = Callable[[BagWriter, Image], None]
 
@@ -157,3 +158,31 @@ def test_the_remedy_is_named_without_parameters(tmp_path, starcal) -> None:
     status, out, _ = starcal('diagnose', path)
     assert status == 3
     assert 'is not a PNG or JPEG' in out.partition('Cannot be calibrated')[2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    'given',
+    [
+        lambda few, folder: [few, '--params', params_with(folder)],
+        # More images than there are, or than most cameras take: a sound set that is refused.
+        lambda few, folder: [few, '--params', params_with(folder, min_images=4)],
+        lambda few, folder: [few, '--params', params_with(folder, min_coverage=1.0)],
+        lambda few, _: [few, '--set', 'min_images=4'],
+        lambda *_: [REAL_SKY / 'polaris'],
+    ],
+)
+def test_it_says_that_all_fits_only_of_what_calibrate_accepts(
+    given, few_images, tmp_path, starcal
+) -> None:
+    arguments = given(few_images, tmp_path)
+    if not Path(arguments[0]).exists():
+        pytest.skip('the real sky is not here')
+    status, out, _ = starcal('diagnose', *arguments, '--json')
+    found = json.loads(out)
+    answer = starcal('calibrate', *arguments, '-o', tmp_path / 'out', '--no-report')
+    assert (status == 0) == (answer.status == 0), answer.err
+    assert (found['cause'] == 'none') == (status == 0)
+    if answer.status:
+        assert found['cause'] in ('refused', 'not_linear')
+        assert found['cause'] != 'refused' or 'but starcal calibrate refuses' in found['sentence']

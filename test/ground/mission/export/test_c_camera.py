@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from starcal_ground.mission.export.c_camera import c_files, c_table, TABLE_FILE
+from starcal_ground.mission.export.c_camera import c_table, TABLE_FILE
 from starcal_ground.mission.export.export_formats import export
 from starcal_ground.mission.export.request import Request
 from starcal_ground.written_files import write_calibration
@@ -62,8 +62,7 @@ def built(
     level: str = '-O0',
 ) -> Path:
     """Compile the exported source with the driver; optimised it takes twice as long."""
-    for name, text in c_files(made).items():
-        (folder / name).write_text(text)
+    export(made, 'c', folder, Request())
     language = 'c++' if standard.startswith('c++') else 'c'
     program = folder / 'check_camera'
     files = [f'-I{folder}', str(folder / 'starcal_camera.c'), str(DRIVER), '-o', str(program)]
@@ -180,9 +179,7 @@ def test_c_gives_the_numbers_of_python(tmp_path, model, with_field) -> None:
 
 
 @pytest.mark.parametrize(('compiler', 'standard'), COMPILERS)
-def test_it_compiles_without_a_warning_and_passes_its_self_test(
-    tmp_path, compiler, standard
-) -> None:
+def test_it_compiles_without_warnings_and_passes_self_test(tmp_path, compiler, standard) -> None:
     made = calibration('tilted', with_field=True)
     program = built(made, tmp_path, compiler, standard, '-O1')
     assert run(program, 'selftest') == (0, '')
@@ -326,8 +323,7 @@ def test_c_and_python_have_the_same_edge_of_the_detector(tmp_path, with_field) -
 
 
 def test_the_function_of_the_page_compiles(tmp_path) -> None:
-    for name, text in c_files(calibration()).items():
-        (tmp_path / name).write_text(text)
+    export(calibration(), 'c', tmp_path, Request())
     page = Path(__file__).parents[4] / 'docs/onboard.md'
     source = page.read_text().split('```c\n')[1].split('```')[0]
     (tmp_path / 'page.c').write_text(source)
@@ -335,8 +331,7 @@ def test_the_function_of_the_page_compiles(tmp_path) -> None:
 
 
 def test_it_uses_no_heap_and_no_function_but_those_of_libm(tmp_path) -> None:
-    for name, text in c_files(calibration('tilted', with_field=True)).items():
-        (tmp_path / name).write_text(text)
+    export(calibration('tilted', with_field=True), 'c', tmp_path, Request())
     made = tmp_path / 'camera.o'
     source = str(tmp_path / 'starcal_camera.c')
     subprocess.run(['gcc', '-std=c99', '-O2', '-c', source, '-o', str(made)], check=True)

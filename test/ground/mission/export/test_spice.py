@@ -28,7 +28,6 @@ SAME_RAD = 1e-12
 
 @pytest.fixture
 def load(tmp_path: Path):
-    """Load the kernels of a calibration into a clean kernel pool."""
 
     def loaded(made: Calibration, names: SpiceNames = NAMES) -> tuple[str, str]:
         paths = [tmp_path / name for name in export(made, 'spice', tmp_path, Request(names)).files]
@@ -258,10 +257,10 @@ def test_without_stars_or_clock_it_is_refused_and_nothing_is_written(tmp_path) -
         written(tmp_path, MADE, [], 0)
     with pytest.raises(OptionError, match='^--kernels: give the leap seconds kernel'):
         export(MADE, 'ck', tmp_path, Request(SpiceNames(-42), observations=[observed(0)]))
-    other = SpiceNames(-42)
     kernels = [tmp_path / 'leap.tls', tmp_path / 'clock.tsc']
+    asked = Request(SpiceNames(-42), observations=[observed(0)], kernels=kernels)
     with pytest.raises(ProductError, match=r'camera\.bc: .*SPICE'):
-        export(MADE, 'ck', tmp_path, Request(other, observations=[observed(0)], kernels=kernels))
+        export(MADE, 'ck', tmp_path, asked)
     assert not (tmp_path / 'camera.bc').exists()
     warmer = dataclasses.replace(observed(0), temperature_degc=30.0)
     assert written(tmp_path, MADE, [warmer], 0).worst_px == 0.0

@@ -24,14 +24,8 @@ from starcal_ground.undistortion import straight_camera
 from starcal_ros.camera import line_of_sight, pixel_grid
 from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import ProductError
-from starcal_ros.formats.products.product_files import read_calibration
-from starcal_ros.records import Calibration, StarObservations, TemperatureTerms, TIMES
+from starcal_ros.records import StarObservations, TemperatureTerms, TIMES
 from starcal_ros.sky.catalog import load_catalog
-
-
-@pytest.fixture(scope='module')
-def made(tiny_products: Path) -> Calibration:
-    return read_calibration(tiny_products / 'calibration.json')
 
 
 @pytest.fixture(scope='module')
@@ -40,8 +34,8 @@ def images(tiny_products: Path) -> tuple[StarObservations, ...]:
 
 
 @pytest.mark.filterwarnings('ignore::astropy.wcs.FITSFixedWarning')
-def test_astropy_reprojects_the_stars_within_the_stated_residual(made, images, tmp_path) -> None:
-    done = export(made, 'wcs', tmp_path, Request(observations=images))
+def test_astropy_reprojects_the_stars_within_the_stated_residual(tiny, images, tmp_path) -> None:
+    done = export(tiny, 'wcs', tmp_path, Request(observations=images))
     assert done.worst_px < 5e-3
     catalog = load_catalog()
     for image, name in zip(images, done.files, strict=True):
@@ -64,33 +58,33 @@ def test_astropy_reprojects_the_stars_within_the_stated_residual(made, images, t
         inner = off[distance <= np.quantile(distance, 0.97)]
         assert np.sqrt(np.mean(inner**2)) <= header['STARRMS'] < 0.25
         # Both ways, over the whole detector.
-        grid = pixel_grid(made.geometry.camera, 9, 9).reshape(-1, 2)
+        grid = pixel_grid(tiny.geometry.camera, 9, 9).reshape(-1, 2)
         there = system.pixel_to_world(*grid.T)
         assert np.abs(np.stack(system.world_to_pixel(there), axis=-1) - grid).max() < 1e-3
         # The inverse polynomials, which Astropy itself does not need.
         assert np.abs(system.sip_foc2pix(system.sip_pix2foc(grid, 0), 0) - grid).max() < 5e-3
         # Angles are those of the camera: aberration and catalog change them by 1e-4.
         u = there.cartesian.xyz.value.T
-        of_camera = line_of_sight(made.geometry.camera, grid)
+        of_camera = line_of_sight(tiny.geometry.camera, grid)
         assert u @ u[0] == pytest.approx(of_camera @ of_camera[0], abs=2e-4)
 
 
 @pytest.mark.parametrize(
     ('floor_px', 'growth'),
     [(0.0, 0.0), (0.3, 0.0), (0.0, 1e-3)],
-    ids=['as made', 'a floor of the centroids', 'a camera that breathes'],
+    ids=['as tiny', 'a floor of the centroids', 'a camera that breathes'],
 )
 def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
-    made, images, floor_px, growth
+    tiny, images, floor_px, growth
 ) -> None:
     rng, errors = np.random.default_rng(1), []
-    found = dataclasses.replace(made, centroid_floor_px=max(floor_px, made.centroid_floor_px))
-    middle = np.array([[made.geometry.camera.width, made.geometry.camera.height]]) / 2.0 - 0.5
+    found = dataclasses.replace(tiny, centroid_floor_px=max(floor_px, tiny.centroid_floor_px))
+    middle = np.array([[tiny.geometry.camera.width, tiny.geometry.camera.height]]) / 2.0 - 0.5
     for index, image in enumerate(images):
         truth, size = scene(scenario('tiny'), index), 1.0 + growth * rng.choice([-1.0, 1.0])
         measured = middle + size * (image.measured_px - middle)
         measured += floor_px * rng.normal(size=measured.shape)
-        pixels = pixel_grid(made.geometry.camera, 5, 5).reshape(-1, 2)
+        pixels = pixel_grid(tiny.geometry.camera, 5, 5).reshape(-1, 2)
         seen = dataclasses.replace(image, measured_px=measured)
         towards, sigma_arcsec = directions_icrf(found, seen, pixels)
         of_image = middle + (pixels - middle) / size
@@ -101,65 +95,60 @@ def test_directions_of_an_image_are_those_of_its_stars_within_their_sigma(
     assert 0.5 < np.sqrt(np.mean(np.square(errors))) < 1.8
 
 
-def test_directions_are_those_of_pixels_by_three_stars(made, images) -> None:
-    beyond, sigma_arcsec = directions_icrf(made, images[0], [[-0.6, 10.0]])
+def test_directions_are_those_of_pixels_by_three_stars(tiny, images) -> None:
+    beyond, sigma_arcsec = directions_icrf(tiny, images[0], [[-0.6, 10.0]])
     assert np.isnan(beyond).all() and np.isnan(sigma_arcsec).all()
     with pytest.raises(ValueError, match='fewer than three stars'):
-        directions_icrf(made, images[0].select(np.arange(len(images[0])) < 2), [[0.0, 0.0]])
+        directions_icrf(tiny, images[0].select(np.arange(len(images[0])) < 2), [[0.0, 0.0]])
+    # An image of unknown temperature has the camera of the calibration.
+    thermal = TemperatureTerms(20.0, (1e-5,), (1e-6,))
+    changing = dataclasses.replace(tiny, temperature=thermal)
+    unknown = dataclasses.replace(images[0], temperature_degc=float('nan'))
+    towards, _ = directions_icrf(changing, unknown, [[320.0, 256.0]])
+    assert towards.tolist() == directions_icrf(tiny, unknown, [[320.0, 256.0]])[0].tolist()
 
 
 @pytest.mark.filterwarnings('ignore::astropy.wcs.FITSFixedWarning')
 def test_stars_in_a_corner_of_an_image_bend_no_coordinates_in_the_others(
-    made, images, tmp_path
+    tiny, images, tmp_path
 ) -> None:
     whole, *_ = (image for image in images if len(image) > 60)
     near = whole.select((whole.measured_px < [[300.0, 240.0]]).all(axis=1))
-    corners, found = pixel_grid(made.geometry.camera, 2, 2).reshape(-1, 2), []
+    corners, found = pixel_grid(tiny.geometry.camera, 2, 2).reshape(-1, 2), []
     for name, image in (('whole', whole), ('near', near)):
-        done = export(made, 'wcs', tmp_path / name, Request(observations=[image]))
+        done = export(tiny, 'wcs', tmp_path / name, Request(observations=[image]))
         header = fits.Header.fromstring(next(iter(done.files.values())))
         places = WCS(header).pixel_to_world(*corners.T).cartesian.xyz.value.T
-        found.append(places * made.geometry.camera.parameters[0])
+        found.append(places * tiny.geometry.camera.parameters[0])
     # Few stars have the attitude to a tenth of a pixel, and the far corner is four times as far.
     assert np.abs(found[0] - found[1]).max() < 0.5
 
 
-def test_an_image_of_unknown_temperature_has_the_camera_of_the_calibration(made, images) -> None:
-    thermal = TemperatureTerms(
-        reference_degc=20.0, focal_per_degc=(1e-5,), focal_per_degc_sigma=(1e-6,)
-    )
-    changing = dataclasses.replace(made, temperature=thermal)
-    unknown = dataclasses.replace(images[0], temperature_degc=float('nan'))
-    towards, _ = directions_icrf(changing, unknown, [[320.0, 256.0]])
-    assert towards.tolist() == directions_icrf(made, unknown, [[320.0, 256.0]])[0].tolist()
-
-
-def test_a_field_beyond_a_gnomonic_projection_is_named(made, images, tmp_path) -> None:
-    wide = straight_camera(made.geometry.camera).replace(
-        fx=25.0, fy=25.0
-    )  # 87 degrees in a corner
+def test_a_field_beyond_a_gnomonic_projection_is_named(tiny, images, tmp_path) -> None:
+    # 87 degrees in a corner.
+    wide = straight_camera(tiny.geometry.camera).replace(fx=25.0, fy=25.0)
     seen = line_of_sight(wide, images[0].measured_px)
-    geometry = dataclasses.replace(made.geometry, camera=wide)
+    geometry = dataclasses.replace(tiny.geometry, camera=wide)
     asked = Request(observations=[dataclasses.replace(images[0], direction_icrf=seen)])
     with pytest.raises(ProductError, match='too wide for a gnomonic projection: use'):
-        export(dataclasses.replace(made, geometry=geometry), 'wcs', tmp_path, asked)
+        export(dataclasses.replace(tiny, geometry=geometry), 'wcs', tmp_path, asked)
 
 
-def test_stars_of_another_catalog_are_named(made, images, tmp_path) -> None:
+def test_stars_of_another_catalog_are_named(tiny, images, tmp_path) -> None:
     strange = dataclasses.replace(images[0], catalog_id=-images[0].catalog_id - 10**7)
     with pytest.raises(ProductError, match=r'lacks \d+ of \d+ stars .* --catalog'):
-        export(made, 'wcs', tmp_path, Request(observations=[strange]))
+        export(tiny, 'wcs', tmp_path, Request(observations=[strange]))
     with pytest.raises(ProductError, match='no image with stars'):
-        export(made, 'wcs', tmp_path, Request())
+        export(tiny, 'wcs', tmp_path, Request())
     asked = Request(observations=images, catalog=tmp_path / 'gone.npz')
     with pytest.raises(ProductError, match='gone.npz: no such catalog; --catalog FILE'):
-        export(made, 'wcs', tmp_path, asked)
+        export(tiny, 'wcs', tmp_path, asked)
 
 
-def test_images_without_a_time_have_no_date(made, images, tmp_path) -> None:
-    undated = dataclasses.replace(made, provenance={**made.provenance, TIMES: 'of the file'})
+def test_images_without_a_time_have_no_date(tiny, images, tmp_path) -> None:
+    undated = dataclasses.replace(tiny, provenance={**tiny.provenance, TIMES: 'of the file'})
     dates = []
-    for one, folder in ((made, tmp_path / 'a'), (undated, tmp_path / 'b')):
+    for one, folder in ((tiny, tmp_path / 'a'), (undated, tmp_path / 'b')):
         folder.mkdir()
         export(one, 'wcs', folder, Request(observations=images[:1]))
         dates.append('DATE-AVG' in fits.getheader(folder / 'image0001.wcs'))

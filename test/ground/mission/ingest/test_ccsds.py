@@ -16,6 +16,7 @@ import pytest
 
 from starcal_ground.images.time_systems import from_text
 from starcal_ground.mission.ingest import sources
+from starcal_ground.mission.ingest.mission_records import Attitudes, Velocities
 from starcal_ros.errors import IngestError
 
 # Orientation of the star tracker in the ICRF; as a transformation of coordinates, ICRF to tracker.
@@ -129,15 +130,14 @@ REFUSED_ATTITUDES = {
 }  # fmt: skip
 
 
-def written(folder: Path, name: str, text: str) -> Path:
-    path = folder / name
-    path.write_bytes(text.encode())
-    return path
+def attitudes(folder: Path, text: str) -> Attitudes:
+    (folder / 'a.aem').write_bytes(text.encode())
+    return sources.attitudes([folder / 'a.aem'], '', AT_NS)
 
 
 @pytest.mark.parametrize('text', ATTITUDES.values(), ids=ATTITUDES)
 def test_an_aem_that_is_valid_is_read(tmp_path, text) -> None:
-    found = sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
+    found = attitudes(tmp_path, text)
     assert found.time_ns.tolist() == [from_text(time, 'UTC') for time in T]
     np.testing.assert_allclose(found.icrf_from_star_tracker_xyzw, [XYZW, XYZW], atol=1e-15)
 
@@ -145,22 +145,18 @@ def test_an_aem_that_is_valid_is_read(tmp_path, text) -> None:
 @pytest.mark.parametrize(('text', 'why'), REFUSED_ATTITUDES.values(), ids=REFUSED_ATTITUDES)
 def test_an_aem_that_is_ambiguous_is_refused(tmp_path, text, why) -> None:
     with pytest.raises(IngestError, match=why) as error:
-        sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
+        attitudes(tmp_path, text)
     assert 'a.aem' in str(error.value) and '\n' not in str(error.value)
 
 
-def test_an_aem_cut_at_any_byte_is_refused_or_whole(tmp_path) -> None:
+def test_an_aem_is_read_within_its_useable_span_and_not_where_it_is_cut(tmp_path) -> None:
+    found = attitudes(tmp_path, aem('2.0', {'USEABLE_STOP_TIME': '2026-05-15T07:20:05'}))
+    assert found.time_ns.tolist() == [from_text(T[0], 'UTC')]
     text = aem('1.0', {})
     for count in range(len('CCSDS_AEM_VERS ='), len(text) - 1):
         with pytest.raises(IngestError) as error:
-            sources.attitudes([written(tmp_path, 'a.aem', text[:count])], '', AT_NS)
+            attitudes(tmp_path, text[:count])
         assert '\n' not in str(error.value)
-
-
-def test_attitudes_outside_the_useable_span_are_left_out(tmp_path) -> None:
-    text = aem('2.0', {'USEABLE_STOP_TIME': '2026-05-15T07:20:05'})
-    found = sources.attitudes([written(tmp_path, 'a.aem', text)], '', AT_NS)
-    assert found.time_ns.tolist() == [from_text(T[0], 'UTC')]
 
 
 def oem(version: str, changes: Changes, more: str = '', end: str = '', head: str = HEAD) -> str:
@@ -215,9 +211,14 @@ REFUSED_VELOCITIES = {
 }  # fmt: skip
 
 
+def velocities(folder: Path, text: str) -> Velocities:
+    (folder / 'a.oem').write_bytes(text.encode())
+    return sources.velocities([folder / 'a.oem'], '', AT_NS)
+
+
 @pytest.mark.parametrize('text', VELOCITIES.values(), ids=VELOCITIES)
 def test_an_oem_that_is_valid_is_read(tmp_path, text) -> None:
-    found = sources.velocities([written(tmp_path, 'a.oem', text)], '', AT_NS)
+    found = velocities(tmp_path, text)
     # Positions of 1.5e8 km have a resolution of 3e-8 km, over 10 s 3e-6 m/s.
     np.testing.assert_allclose(found.velocity_m_s, [np.multiply(VELOCITY_KM_S, 1e3)], atol=2e-5)
 
@@ -225,5 +226,5 @@ def test_an_oem_that_is_valid_is_read(tmp_path, text) -> None:
 @pytest.mark.parametrize(('text', 'why'), REFUSED_VELOCITIES.values(), ids=REFUSED_VELOCITIES)
 def test_an_oem_that_is_invalid_is_refused(tmp_path, text, why) -> None:
     with pytest.raises(IngestError, match=why) as error:
-        sources.velocities([written(tmp_path, 'a.oem', text)], '', AT_NS)
+        velocities(tmp_path, text)
     assert 'a.oem' in str(error.value) and '\n' not in str(error.value)

@@ -72,11 +72,9 @@ class Handler(BaseHTTPRequestHandler):
     server: Store
 
     def do_HEAD(self) -> None:
-        """Answer without a content."""
         self.do_GET()
 
     def do_GET(self) -> None:
-        """Answer, or fail as the store is told to."""
         store, line = self.server, urllib.parse.unquote(f'{self.command} {self.path}')
         store.requests.append(line)
         fault = next((n for pattern, n in store.faults.items() if re.search(pattern, line)), 200)

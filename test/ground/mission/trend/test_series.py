@@ -44,22 +44,17 @@ def test_a_change_is_the_rotation_in_pixels() -> None:
     assert (second.row, second.against) == (2, 0) and second.px < 1e-6
 
 
-def test_without_activations_each_accepted_one_is_taken_as_active() -> None:
+def test_activations_are_those_recorded_or_each_accepted_one() -> None:
     rows = [made(1), made(2, accepted=False, reasons=('bad',)), made(3)]
     assert [k for _, k in activations(rows)] == [0, 2]
     assert pairs(rows, activations(rows)) == [(1, 0), (2, 0)]
     assert activations(rows[1:2]) == [] and pairs(rows[1:2], []) == []
-
-
-def test_a_calibration_that_was_activated_twice_counts_once_in_a_series() -> None:
+    # One that was activated twice counts once in a series.
     rows = [made(1, active_since_ns=5), made(2, active_since_ns=8), made(1, active_since_ns=9)]
     assert [row.stamp for row in distinct(rows)] == ['1', '2']
     assert activations(rows) == [(5, 0), (8, 1), (9, 2)]
-
-
-def test_cameras_are_apart_and_failures_are_none() -> None:
-    other = made(2, child_frame='other')
-    rows = [made(1), other, made(3), Row('x', 'x', FAILED, error='bad')]
+    # Cameras are apart, and failures are none.
+    rows = [made(1), made(2, child_frame='other'), made(3), Row('x', 'x', FAILED, error='bad')]
     assert [len(group) for group in groups(rows).values()] == [2, 1]
 
 
@@ -107,12 +102,6 @@ def test_a_drift_a_season_and_steps_are_told_apart() -> None:
     assert np.abs(found.fit - truth).max() < 0.25
 
 
-def test_sigmas_that_are_too_small_do_not_make_steps() -> None:
-    noise = np.random.default_rng(2).normal(0, 1.0, N)
-    found = trend_of(TIME_S, noise, np.full(N, 0.05), SEASONS)
-    assert found.terms == () and found.scatter == pytest.approx(20, rel=0.3)
-
-
 def test_a_drift_of_many_sigmas_is_found_in_few_calibrations() -> None:
     """Seven in three years: the scatter of five residuals alone is no measure of the sigmas."""
     years = np.arange(7) / 2
@@ -124,18 +113,15 @@ def test_a_drift_of_many_sigmas_is_found_in_few_calibrations() -> None:
     assert term.sigma == pytest.approx(3.8, abs=0.1)
 
 
-def test_a_single_outlier_is_no_step() -> None:
+def test_an_outlier_a_short_series_and_unknown_temperatures_are_no_finding() -> None:
     truth = np.zeros(N)
     truth[25] = 1.0
     assert measured(4, truth).terms == ()
-
-
-def test_a_short_series_is_not_tested() -> None:
+    noise = np.random.default_rng(2).normal(0, 1.0, N)  # of sigmas that are too small
+    found = trend_of(TIME_S, noise, np.full(N, 0.05), SEASONS)
+    assert found.terms == () and found.scatter == pytest.approx(20, rel=0.3)
     found = trend_of(TIME_S[:5], np.array([0, 0, 0, 9, 9.0]), np.full(5, 0.1), SEASONS[:5])
     assert found.terms == () and np.isnan(found.scatter)
-
-
-def test_unknown_temperatures_are_no_regressor() -> None:
     value = 0.05 * (SEASONS - 20)
     found = trend_of(TIME_S, value, np.full(N, 5.0), np.full(N, np.nan))
     assert all(term.kind != 'temperature' for term in found.terms)

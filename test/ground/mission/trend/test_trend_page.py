@@ -51,7 +51,10 @@ def test_the_verdict_is_open_where_too_few_tell(name) -> None:
     assert verdict.headline[1] == headlines[expected]
 
 
-def test_a_drift_is_in_the_headline_of_the_page(tmp_path) -> None:
+def test_a_drift_is_in_the_headline_and_an_assumed_activation_in_the_page(tmp_path) -> None:
+    for is_accepted in (False, True):
+        write_page([[made(1, accepted=is_accepted)]], 1, tmp_path, 'fleet')
+        assert ('No activation is rec' in (tmp_path / 'trend.html').read_text()) is is_accepted
     rows = [made(day, (0, 20.0 * day, 0)) for day in range(1, 9)]
     page = write_page([rows], 1, tmp_path, 'fleet')
     assert page.verdicts[0].is_stable and page.verdicts[0].word == 'drifting'
@@ -64,12 +67,6 @@ def test_a_series_that_is_too_short_is_not_tested(tmp_path, count, words) -> Non
     write_page([[made(day) for day in range(1, count + 1)]], 1, tmp_path, 'fleet')
     captions = re.findall('<figcaption>(.*)</figcaption>', (tmp_path / 'trend.html').read_text())
     assert len(captions) > 10 and all(words in caption for caption in captions[1:])
-
-
-def test_an_activation_that_is_assumed_is_named(tmp_path) -> None:
-    for is_accepted in (False, True):
-        write_page([[made(1, accepted=is_accepted)]], 1, tmp_path, 'fleet')
-        assert ('No activation is rec' in (tmp_path / 'trend.html').read_text()) is is_accepted
 
 
 @pytest.mark.parametrize(('note', 'is_missed'), [('met', False), ('missed by 0.2 px', True)])
@@ -113,9 +110,8 @@ def test_of_100_cameras_those_that_changed_are_named(tmp_path) -> None:
 
 def refused(row: Row) -> Row:
     assert row.calibration is not None
-    return dataclasses.replace(
-        row, calibration=dataclasses.replace(row.calibration, accepted=False)
-    )
+    made = dataclasses.replace(row.calibration, accepted=False)
+    return dataclasses.replace(row, calibration=made)
 
 
 def found_in(page: str) -> dict[str, str]:
