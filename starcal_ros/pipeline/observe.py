@@ -215,7 +215,7 @@ def _with_one(
         observations.background_dn,
         observations.noise_dn,
         geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw),
-        float(geometry.camera.parameters[0]),
+        geometry.camera,
     )
     return observations, dataclasses.replace(
         track,
