@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -38,19 +38,34 @@ class DetectorFrames:
     hot: HotPixels = NO_HOT_PIXELS
     pedestal_dn: int = 0
 
-    def corrected(self, image: Image, options: CentroidOptions) -> Image:
+    def corrected(self, image: Image, options: CentroidOptions) -> tuple[Image, CentroidOptions]:
         """
-        Image without the dark frame, divided by the flat field.
+        Image without the dark frame, divided by the flat field, and the options to measure it.
+
+        The raw pixels show which are saturated.  A flat field leaves them no common level: they
+        get one that no other pixel reaches, and ``saturation_dn`` states it.
 
         Raises ImageRefused ``bad_encoding`` if the dark frame has another type of pixels.
         """
-        return self._flattened(self._without_dark(image, options))
+        pixels = image.pixels
+        if self.dark is None and self.flat is None:
+            return image, options
+        full_dn = saturation_level(pixels, options, quantisation_step_dn(pixels))
+        saturated = pixels >= (full_dn or np.inf)
+        level, top = self._flattened(self._without_dark(pixels)), int(pixels.max())
+        if self.flat is not None:
+            level[saturated] = 0
+            top = min(max(top, int(level.max()) + 1), np.iinfo(pixels.dtype).max)
+            if full_dn:
+                options = replace(options, saturation_dn=float(top))
+        level[saturated | (level > top)] = top
+        return Image(image.time_ns, level), options
 
-    def _without_dark(self, image: Image, options: CentroidOptions) -> Image:
-        """Image minus dark frame, kept positive by adding the median of the dark frame."""
-        pixels, dark = image.pixels, self.dark
+    def _without_dark(self, pixels: Pixels) -> Pixels:
+        """Pixels minus dark frame, kept positive by adding the median of the dark frame."""
+        dark = self.dark
         if dark is None:
-            return image
+            return pixels
         if dark.dtype != pixels.dtype:
             raise ImageRefused(
                 'bad_encoding', f'{pixels.dtype} image, the dark frame is {dark.dtype}'
@@ -59,23 +74,15 @@ class DetectorFrames:
         below = np.minimum(dark, dark.dtype.type(self.pedestal_dn))
         raised = cv2.add(pixels, dark.dtype.type(self.pedestal_dn) - below)
         level: Pixels = cv2.subtract(raised, dark - below)
-        # Saturated pixels stay at the end of the range, so that they are still found.
-        peak = int(pixels.max())
-        full_dn = saturation_level(pixels, options, quantisation_step_dn(pixels)) or np.inf
-        level[(level > peak) | (pixels >= full_dn)] = peak
-        return Image(image.time_ns, level)
+        return level
 
-    def _flattened(self, image: Image) -> Image:
-        """Image divided by the flat field above the pedestal; of blind pixels as it is."""
-        pixels, flat = image.pixels, self.flat
-        if flat is None:
-            return image
-        peak = int(pixels.max())
-        signal = (pixels.astype(np.float32) - self.pedestal_dn) / np.nan_to_num(flat, nan=1.0)
-        level = np.clip(np.rint(signal + self.pedestal_dn), 0, peak)
-        level[pixels == peak] = peak  # so that saturated pixels are still found
-        cast = level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
-        return Image(image.time_ns, cast)
+    def _flattened(self, pixels: Pixels) -> Pixels:
+        """Pixels divided by the flat field above the pedestal; blind pixels as they are."""
+        if self.flat is None:
+            return pixels
+        signal = (pixels.astype(np.float32) - self.pedestal_dn) / np.nan_to_num(self.flat, nan=1.0)
+        level = np.clip(np.rint(signal + self.pedestal_dn), 0, np.iinfo(pixels.dtype).max)
+        return level.astype(np.uint8) if pixels.dtype == np.uint8 else level.astype(np.uint16)
 
 
 NO_FRAMES = DetectorFrames()

@@ -131,7 +131,8 @@ def observe_next(
         known |= vars(found[0]) | {'catalog_digest': setup.catalog.digest}
         detector, saturation_dn = setup.detector, setup.centroid.saturation_dn
         screen(sample, seen, track.seen, saturation_dn, detector.dark, setup.screening)
-        corrected = detector.corrected(image, setup.centroid)
+        corrected, centroid = detector.corrected(image, setup.centroid)
+        setup = dataclasses.replace(setup, centroid=centroid)
         exposures = [
             Exposure(
                 corrected,
@@ -215,7 +216,7 @@ def _with_one(
         observations.background_dn,
         observations.noise_dn,
         geometry.icrf_from_camera(exposure.icrf_from_star_tracker_xyzw),
-        float(geometry.camera.parameters[0]),
+        geometry.camera,
     )
     return observations, dataclasses.replace(
         track,

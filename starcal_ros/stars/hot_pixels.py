@@ -16,13 +16,16 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask, Pixels
+from starcal_ros.camera import CameraModel, line_of_sight
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import MAD_TO_SIGMA, median
 from starcal_ros.stars.pixel_noise import quantisation_step_dn, rounding_noise_dn
 
 _SCANNED_PX = 1 << 19  # pixels scanned per image, in 0.1 ms; larger images are scanned by strips
 _MOVED_PX = 5.0  # the light of a star that has moved so far has left its pixels
-_SPILT = 0.2  # mean of the four adjacent pixels over the peak: 0.24 for a star of 0.45 px
+# Mean of the four adjacent pixels over the peak: 0.2 for a star of 0.47 px on the centre of one.
+# A limit for sharper stars would miss hot pixels in the noise and in the wings of stars.
+_SPILT = 0.2
 _BESIDE = np.array([[1, -1, 0, 0], [0, 0, 1, -1]])[:, :, None]  # offsets in rows and columns
 CORE_PX = 1.5  # a hot pixel this near spoils the peak of a star
 _WIDE_PSF_PX = 1.5  # each pixel of such a star has under 7 % of its light: the fit can omit one
@@ -77,13 +80,14 @@ def learn_hot_pixels(
     background_dn: float,
     noise_dn: float,
     icrf_from_camera: Rotation,
-    focal_px: float,
+    camera: CameraModel,
 ) -> HotPixels:
     """
     Hot pixels after one more image; one strip of it is scanned.
 
-    ``pixels`` (height, width) are without the dark frame.  A strip is compared with its last scan
-    once ``icrf_from_camera`` has moved the stars by more than a PSF.
+    ``pixels`` (height, width) are without the dark frame.  A pixel is hot if it is lit again after
+    ``icrf_from_camera`` has moved the stars there by more than a PSF: a roll moves none at its
+    axis.  A scan of a strip is replaced once they have moved at half of the pixels lit again.
     """
     height = pixels.shape[0]
     count = -(-pixels.size // _SCANNED_PX)
@@ -91,15 +95,21 @@ def learn_hot_pixels(
     before = strips[known.next_strip]
     following = (known.next_strip + 1) % count
     if before is not None:
-        moved_px = (before.icrf_from_camera.inv() * icrf_from_camera).magnitude() * focal_px
-        if moved_px < _MOVED_PX:
+        turn = before.icrf_from_camera.inv() * icrf_from_camera
+        moved_rad = _MOVED_PX / float(camera.parameters[0])
+        if turn.magnitude() < moved_rad:
             return HotPixels(known.index, strips, following)
     rows = (known.next_strip * height // count, (known.next_strip + 1) * height // count)
     lit = _single_lit(pixels, rows, background_dn, _HOT_SIGMA * noise_dn)
     index = known.index
     if before is not None:
         again = np.intersect1d(before.lit, lit, assume_unique=True)
-        index = np.union1d(index, again)[:_MOST]
+        v, u = np.divmod(again, pixels.shape[1])
+        direction = line_of_sight(camera, np.stack([u, v], axis=-1).astype(np.float64))
+        moved = np.linalg.norm(turn.apply(direction) - direction, axis=-1) >= moved_rad
+        index = np.union1d(index, again[moved])[:_MOST]
+        if 2 * np.count_nonzero(moved) < len(again):
+            return HotPixels(index, strips, following)
     strip = Strip(lit, icrf_from_camera)
     return HotPixels(
         index, (*strips[: known.next_strip], strip, *strips[known.next_strip + 1 :]), following

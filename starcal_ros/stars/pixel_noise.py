@@ -22,11 +22,11 @@ import math
 
 import numpy as np
 
-from starcal_ros.arrays import Floats, Pixels
+from starcal_ros.arrays import Floats, Indices, Pixels
 
 # Largest values of converters of 8 to 16 bits, in quantisation steps.
 CONVERTER_ENDS = (255, 1023, 4095, 16383, 65535)
-_STEP_SAMPLE = 64  # rows and columns read of a frame: their noise alone shows the step
+_STEP_SAMPLE = 64  # rows and columns read of a frame: the noise of most skies shows the step
 # Values that show a step: seven differences are all even by chance once in 100 times.
 _FEWEST_VALUES = 8
 _SIGNIFICANT = 3.0  # sigma
@@ -41,9 +41,19 @@ def quantisation_step_dn(pixels: Pixels) -> int:
     pixels is that part of a step, and the end of its converter that many steps.
     """
     down, across = (max(1, side // _STEP_SAMPLE) for side in pixels.shape)
-    # A table of counts takes a twentieth of the time of a sort.
-    values = np.flatnonzero(np.bincount(pixels[::down, ::across].ravel()))
+    values = _values(pixels[::down, ::across])
+    # The step of the frame divides that of its sample: it is read as a whole only if quiet.
+    if len(values) < _FEWEST_VALUES and np.gcd.reduce(np.diff(values)) != 1:
+        # Part by part, since a count converts its pixels to 8 bytes.
+        parts = [_values(pixels[first::_STEP_SAMPLE]) for first in range(_STEP_SAMPLE)]
+        values = np.unique(np.concatenate(parts))
     return int(np.gcd.reduce(np.diff(values))) if len(values) >= _FEWEST_VALUES else 1
+
+
+def _values(pixels: Pixels) -> Indices:
+    """Values (k,) of the pixels, sorted."""
+    # A table of counts takes a twentieth of the time of a sort.
+    return np.flatnonzero(np.bincount(pixels.ravel()))
 
 
 def rounding_noise_dn(step_dn: float) -> float:

@@ -247,7 +247,7 @@ def test_pixels_without_response_or_with_a_current_are_bad(
     path = write_png(tmp_path / 'frame.png', frame)
     setup = load_setup(values(camera_yaml, **{option: path}))
     assert setup.detector.hot.index.tolist() == [7 * WIDTH + 9]
-    corrected = DetectorFrames(flat=setup.detector.flat).corrected(image(), setup.centroid)
+    corrected, _ = DetectorFrames(flat=setup.detector.flat).corrected(image(), setup.centroid)
     assert (corrected.pixels == image().pixels).all()
 
 
@@ -264,11 +264,29 @@ def test_the_dust_and_noise_of_a_flat_field_are_no_stars(camera_yaml, tmp_path) 
     assert setup.detector.flat is not None
 
 
-def test_saturated_pixels_stay_at_the_peak() -> None:
-    pixels = np.array([[4095, 2000], [1000, 4095]], np.uint16)
-    flat = np.array([[1.5, 0.25], [0.5, 0.5]])
-    found = DetectorFrames(flat=flat).corrected(Image(1, pixels), CentroidOptions())
-    assert found.pixels.tolist() == [[4095, 4095], [2000, 4095]]
+@pytest.mark.parametrize(
+    ('raw', 'stated_dn', 'expected', 'level_dn'),
+    [
+        ([4095, 2000, 1000, 4095], 0.0, [8001, 8000, 2000, 8001], 8001.0),
+        ([4095, 1000, 1000, 4095], 0.0, [4095, 4000, 2000, 4095], 4095.0),
+        ([2010, 1000, 1000, 1990], 1900.0, [4001, 4000, 2000, 4001], 4001.0),  # a full well
+        ([1800, 1000, 1000, 300], 1900.0, [1200, 4000, 2000, 600], 4001.0),  # none is saturated
+        ([1800, 1000, 1000, 300], 0.0, [1200, 4000, 2000, 600], 0.0),
+        ([65535, 30000, 1000, 300], 0.0, [65535, 65535, 2000, 600], 65535.0),
+    ],
+)
+@pytest.mark.parametrize('has_dark', [False, True])
+def test_the_raw_pixels_show_which_are_saturated(
+    raw: list[int], stated_dn: float, expected: list[int], level_dn: float, has_dark: bool
+) -> None:
+    """The others are divided by the flat field, also the brightest, and none reaches the level."""
+    pixels, flat = np.array([raw], np.uint16), np.array([[1.5, 0.25, 0.5, 0.5]])
+    dark = np.zeros_like(pixels) if has_dark else None
+    found, options = DetectorFrames(dark=dark, flat=flat).corrected(
+        Image(1, pixels), CentroidOptions(saturation_dn=stated_dn)
+    )
+    assert found.pixels.tolist() == [expected]
+    assert options.saturation_dn == level_dn
 
 
 @pytest.mark.parametrize(

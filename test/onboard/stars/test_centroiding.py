@@ -331,6 +331,13 @@ def test_the_saturation_level(dtype, step_dn, peak, count, expected) -> None:
     assert saturation_level(pixels, CentroidOptions(saturation_dn=123.0), step_dn) == 123.0
 
 
+@pytest.mark.parametrize('step_dn', [1, 16, 257])
+def test_the_few_stars_of_a_quiet_sky_show_the_step(step_dn: int) -> None:
+    pixels = np.full((960, 1280), 5, np.uint16)
+    pixels[101, 201:210] = [7, 30, 90, 140, 160, 130, 80, 20, 6]
+    assert quantisation_step_dn(pixels * np.uint16(step_dn)) == step_dn
+
+
 @pytest.mark.parametrize('psf_sigma_px', [0.7, 0.95, 2.0])
 def test_of_a_star_at_the_border_the_fit_takes_what_is_in_the_image(psf_sigma_px: float) -> None:
     detector = dataclasses.replace(QUIET, psf_sigma_px=psf_sigma_px)

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from starcal_ground.simulation import rendering, scenario
 from starcal_ros.arrays import Pixels
+from starcal_ros.camera import CameraModel
 from starcal_ros.records import StarRefusal
 from starcal_ros.stars.hot_pixels import (
     hot_in_dark,
@@ -22,8 +23,8 @@ from starcal_ros.stars.hot_pixels import (
 UNKNOWN = HotPixels(np.empty(0, np.int64))
 SCENARIO = scenario.scenario('tiny', seed=3)
 DETECTOR = SCENARIO.detector
-WIDTH = SCENARIO.truth.camera.width
-FOCAL_PX = float(SCENARIO.truth.camera.parameters[0])
+CAMERA = SCENARIO.truth.camera
+WIDTH = CAMERA.width
 BACKGROUND_DN = DETECTOR.offset_dn + DETECTOR.background_electrons / DETECTOR.electrons_per_dn
 NOISE_DN = DETECTOR.noise_electrons / DETECTOR.electrons_per_dn
 
@@ -44,7 +45,7 @@ def images(count: int, looking: int | None = None) -> tuple[tuple[Pixels, Rotati
 
 def learnt(seen: tuple[tuple[Pixels, Rotation], ...], known: HotPixels = UNKNOWN) -> HotPixels:
     for pixels, looking in seen:
-        known = learn_hot_pixels(known, pixels, BACKGROUND_DN, NOISE_DN, looking, FOCAL_PX)
+        known = learn_hot_pixels(known, pixels, BACKGROUND_DN, NOISE_DN, looking, CAMERA)
     return known
 
 
@@ -81,16 +82,30 @@ def test_cosmic_rays_are_not_hot() -> None:
     assert len(known.index) == 0
 
 
+def test_a_roll_moves_no_star_at_its_axis() -> None:
+    """Lit all the time: a pixel near the axis, which may be a star, and one 270 px from it."""
+    pixels = np.full((CAMERA.height, WIDTH), round(BACKGROUND_DN), np.uint16)
+    u, v = np.rint(CAMERA.parameters[3:5]).astype(int)
+    pixels[v, [u - 20, u + 270]] += round(40 * NOISE_DN)
+    rolled = [Rotation.from_rotvec([0.0, 0.0, 0.005 * k]) for k in range(9)]
+    known, found = UNKNOWN, []
+    for looking in (*rolled, Rotation.from_euler('x', 1, degrees=True)):
+        known = learnt(((pixels, looking),), known)
+        found.append(len(known.index))
+    assert found == [0, 0, 0, 0, 1, 1, 1, 1, 1, 2]
+
+
 def test_large_detectors_are_scanned_in_turns() -> None:
     """Eleven strips: each is seen a second time by the twenty-second image."""
     hot = np.array([[3, 100], [1000, 1300], [2000, 2500]])
     noise = np.random.default_rng(2).normal(100.0, 2.0, (2048, 2592))
     pixels = np.rint(noise).astype(np.uint16)
     pixels[hot[:, 0], hot[:, 1]] = 300
+    camera = CameraModel(2592, 2048, np.array([7e3, 0, 7e3, 1295.5, 1023.5, 0, 0, 0, 0, 0]))
     known, found = UNKNOWN, []
     for k in range(22):
         looking = Rotation.from_euler('x', k, degrees=True)
-        known = learn_hot_pixels(known, pixels, 100.0, 2.0, looking, 7000.0)
+        known = learn_hot_pixels(known, pixels, 100.0, 2.0, looking, camera)
         found.append(len(known.index))
     assert found == [0] * 11 + [1] * 5 + [2] * 5 + [3]
     np.testing.assert_array_equal(known.index, hot @ [2592, 1])
