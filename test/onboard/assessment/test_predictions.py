@@ -105,7 +105,10 @@ def test_images_are_grouped_by_their_time_in_any_order() -> None:
     given = of_random_pointings(3)
     ensemble = true_observations(given)
     turned = Ensemble(tuple(reversed(ensemble.images)))
-    one, other = ([b.normalised for b in bins_of(given, x, 'image')] for x in (ensemble, turned))
+    one, other = (
+        [bin.normalised for bin in bins_of(given, images) if bin.by == 'image']
+        for images in (ensemble, turned)
+    )
     assert len(one) > 1 and one == pytest.approx(other, rel=1e-6)
 
 
