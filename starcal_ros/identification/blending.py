@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from starcal_ros.arrays import Floats, Mask
-from starcal_ros.identification.prediction import Prediction
+from starcal_ros.identification.prediction import in_image, Prediction
 from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import CLOSE_PAIR_RAD, StarCatalog
 from starcal_ros.stars.centroiding import Centroids, SWAMPED_SIGMA
@@ -51,6 +51,7 @@ def neighbour_pulls(
     model: ImageModel,
     modelled: Mask,
     measured: Mask,
+    inside: Mask,
 ) -> Pulls:
     """
     Pull of the neighbours, all of ``xy_px`` (n + k, 2), on the centroids of the first n of them.
@@ -59,6 +60,8 @@ def neighbour_pulls(
     from the difference of the magnitudes.  For an unresolved pair the pull is from the star to the
     common centre of light.  The light of ``modelled`` (n,) stars is already subtracted.  Only the
     ``measured`` (n,) stars get a pull: most stars of a wide field are too faint to be measured.
+    Of a neighbour that is not ``inside`` (n + k,) the image the border may cut off all the light
+    or none: half of its pull is taken, with as large an uncertainty.
     """
     sigma_px = model.psf_sigma_px or 1.0
     radius_px = stamp_radius_px(sigma_px, model.longest_streak_px)
@@ -91,7 +94,8 @@ def neighbour_pulls(
     # Share of the neighbour's light in the measured flux: the overlap of two Gaussians.
     within = np.where(known, 0.0, np.exp(-((0.5 * distance_px / sigma_px) ** 2)))
     own_flux = flux / (1.0 + ratio * within)
-    pull_px = neighbour_pull_px(
+    whole = inside[other[matters]]
+    pull_px = np.where(whole, 1.0, 0.5)[:, None] * neighbour_pull_px(
         own_flux,
         offset_px,
         ratio * own_flux,
@@ -102,7 +106,7 @@ def neighbour_pulls(
     )
     total_px, uncertain_px = np.zeros((2, len(flux_dn), 2))
     np.add.at(total_px, star[~known], pull_px[~known])
-    part = np.where(known, _MODELLED_UNCERTAINTY, _PULL_UNCERTAINTY)
+    part = np.where(known, _MODELLED_UNCERTAINTY, np.where(whole, _PULL_UNCERTAINTY, 1.0))
     np.add.at(uncertain_px, star, part[:, None] * pull_px)
     return Pulls(total_px, uncertain_px, swamped, outshone)
 
@@ -132,12 +136,13 @@ def separate(
     catalog: StarCatalog,
     centroids: Centroids,
     model: ImageModel,
-    deeper: tuple[Floats, Floats],
+    unmeasured: tuple[Floats, Floats],
 ) -> tuple[Centroids, Mask]:
     """
     Centroids corrected for catalog neighbours, and a mask (n,) of the isolated stars.
 
-    ``deeper`` are pixels (k, 2) and magnitudes (k,) of neighbours below the magnitude limit.
+    ``unmeasured`` are pixels (k, 2) and magnitudes (k,) of other neighbours: below the magnitude
+    limit, and beyond the border.
 
     The pull is subtracted and its uncertainty added to the covariance; a star with an uncertainty
     above `MAX_BLEND_SIGMA` is refused as a blend.  The same applies to close companions that the
@@ -147,14 +152,16 @@ def separate(
     # The search for lost lines also uses the stars measured far from their predictions.
     reason = centroids.refusal
     measured = (reason == StarRefusal.NONE) | (reason == StarRefusal.NOT_DETECTED)
-    deeper_px, deeper_magnitude = deeper
+    unmeasured_px, unmeasured_magnitude = unmeasured
+    xy_px = np.concatenate([prediction.xy_px, unmeasured_px])
     pulls = neighbour_pulls(
-        np.concatenate([prediction.xy_px, deeper_px]),
-        np.concatenate([magnitude, deeper_magnitude]),
+        xy_px,
+        np.concatenate([magnitude, unmeasured_magnitude]),
         centroids.flux_dn,
         model,
         centroids.modelled,
         measured,
+        in_image(xy_px, prediction.camera),
     )
     unlisted = _alone(prediction.direction_icrf, catalog.close_pair[prediction.catalog_index])
     faintest = float((catalog.deeper or catalog).magnitude[-1])

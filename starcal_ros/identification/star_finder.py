@@ -211,7 +211,8 @@ def measure_predicted(
     """
     catalog, options = search.catalog, search.identification
     pixels, hot_pixels = exposure.image.pixels, exposure.hot_pixels
-    shown = prediction.select(in_image(prediction.xy_px, prediction.camera))
+    is_inside = in_image(prediction.xy_px, prediction.camera)
+    shown, beyond = prediction.select(is_inside), prediction.select(~is_inside)
     least_snr = search.centroid.min_snr
     count = detection.detectable_count(pixels, shown.xy_px, model.background, least_snr)
     looked_at = shown.select(np.arange(len(shown.xy_px)) < count)
@@ -224,7 +225,7 @@ def measure_predicted(
             measured = measure_stars(pixels, looked_at.xy_px, model, search.centroid, hot_pixels)
     # Faint stars are refused, but their light may pull the centroids of the others.
     faint = with_faint(measured, shown.xy_px)
-    deeper = deeper_stars(
+    deeper_px, deeper_mag = deeper_stars(
         shown,
         faint.refusal == StarRefusal.NONE,
         _DEEPER_SIGMA * model.extent_px,
@@ -233,7 +234,12 @@ def measure_predicted(
         exposure.velocity.m_s,
         exposure.site,
     )
-    centroids, alone = separate(shown, catalog, faint, model, deeper)
+    # The light of a star beyond the border pulls those inside.
+    unmeasured = (
+        np.concatenate([deeper_px, beyond.xy_px]),
+        np.concatenate([deeper_mag, catalog.magnitude[beyond.catalog_index]]),
+    )
+    centroids, alone = separate(shown, catalog, faint, model, unmeasured)
     _refuse_line_loss(shown.xy_px, centroids, pixels.shape)
     refusal = refuse_on_hot_pixels(
         shown.xy_px,

@@ -20,7 +20,7 @@ from starcal_ros.identification.blending import (
     unlisted_pull_px,
 )
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
-from starcal_ros.sky.catalog import DEEPER_MAG, load_catalog
+from starcal_ros.sky.catalog import cone, DEEPER_MAG, load_catalog
 from starcal_ros.stars.detection import Background
 from starcal_ros.stars.image_model import ImageModel, uniform_width
 from starcal_ros.stars.pixel_noise import PixelNoise
@@ -55,7 +55,7 @@ def pulls_on(
 ) -> Pulls:
     """Pulls on stars that are all measured, and none subtracted from another."""
     none = np.zeros(len(xy_px), bool)
-    return neighbour_pulls(xy_px, magnitude, flux_dn, model, none, ~none)
+    return neighbour_pulls(xy_px, magnitude, flux_dn, model, none, ~none, ~none)
 
 
 def pulls(ratio: float, distance_px: float, flux_dn: list[float], noise_dn: float) -> Pulls:
@@ -127,6 +127,17 @@ def test_only_the_fainter_of_two_unlike_stars_is_swamped() -> None:
     assert 0 < pull_px[0, 0] < 0.05 and not pull_px[2].any()
 
 
+def test_half_of_the_pull_is_taken_of_a_neighbour_that_the_border_may_cut_off() -> None:
+    pair, flux = np.array([[100.0, 1.0], [100.0, -2.5]]), np.array([5000.0])
+    model, magnitude, one = image_model(2.1), np.array([5.0, 6.0]), np.ones(1, bool)
+    whole, cut = (
+        neighbour_pulls(pair, magnitude, flux, model, ~one, one, np.array([True, inside]))
+        for inside in (True, False)
+    )
+    assert 0 > cut.pull_px[0, 1] == pytest.approx(0.5 * whole.pull_px[0, 1])
+    assert np.abs(cut.uncertain_px).tolist() == np.abs(cut.pull_px).tolist()
+
+
 def test_no_neighbours_no_pulls() -> None:
     model = image_model(2.1)
     none = pulls_on(np.empty((0, 2)), np.empty(0), np.empty(0), model)
@@ -155,14 +166,15 @@ def test_the_pull_of_deeper_stars_is_taken_off() -> None:
     assert excess_sigma2(deeper=True) < 1.1
 
 
-@pytest.mark.parametrize('limit', [5.0, 7.0, 9.0])
+@pytest.mark.parametrize('limit', [4.6, 5.0, 7.0, 9.0])
 def test_deeper_stars_follow_the_limit(limit: float) -> None:
     catalog, deeper = load_catalog(None, limit), load_catalog(None, limit).deeper
-    assert catalog.magnitude[-1] <= limit
+    assert catalog.magnitude[-1] <= limit + 1e-9
+    assert len(cone(catalog, np.array([1.0, 0.0, 0.0]), np.pi, limit)) == len(catalog)
     if limit == 9.0:
         assert deeper is None
         return
     assert deeper is not None
-    assert limit < deeper.magnitude[0] and deeper.magnitude[-1] <= limit + DEEPER_MAG
+    assert limit < deeper.magnitude[0] and deeper.magnitude[-1] <= limit + DEEPER_MAG + 1e-9
     whole = load_catalog(None, limit + DEEPER_MAG)
     assert np.array_equal(np.concatenate([catalog.id, deeper.id]), whole.id)

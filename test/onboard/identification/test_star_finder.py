@@ -238,6 +238,27 @@ def test_a_companion_that_the_catalog_has_not_makes_a_star_less_sure(monkeypatch
     np.testing.assert_array_equal(after.measured_px[j], before.measured_px[i])
 
 
+def test_a_star_beyond_the_border_spoils_the_one_beside_it() -> None:
+    one, exposure = shown(0)
+    found = observed(exposure)
+    star = found.catalog_id[(found.measured_px[:, 0] > 400) & (found.snr > 30)][0]
+    (u, _), (row,) = true_px(one, np.array([star]))[0], CATALOG.rows_of(np.array([star]))[0]
+    width = int(u) + 3
+    camera = dataclasses.replace(PRIOR.camera, width=width)
+    cut = with_pixels(exposure, np.ascontiguousarray(exposure.image.pixels[:, :width]))
+    # The same star again, 4 px farther to the right.
+    twice = CATALOG.select(np.insert(np.arange(len(CATALOG)), row, row))
+    x, y, z = twice.direction_icrs[row] + 4.0 / camera.parameters[0] * one.camera_from_icrf[0]
+    ra_rad, dec_rad, number = twice.ra_rad.copy(), twice.dec_rad.copy(), twice.id.copy()
+    ra_rad[row], dec_rad[row] = np.arctan2(y, x) % (2 * np.pi), np.arctan2(z, np.hypot(x, y))
+    number[row] = number.max() + 1
+    twice = dataclasses.replace(twice, ra_rad=ra_rad, dec_rad=dec_rad, id=number)
+    geometry = dataclasses.replace(PRIOR, camera=camera)
+    alone, beside = (observed(cut, geometry, StarSearch(sky)) for sky in (CATALOG, twice))
+    assert star in alone.catalog_id and star not in beside.catalog_id
+    assert len(beside) == len(alone) - 1
+
+
 def test_an_unknown_proper_motion_is_in_the_covariance() -> None:
     """Ten years of the usual motion in a camera of 100 arcsec a pixel, and nothing else."""
     _, exposure = shown(0)
