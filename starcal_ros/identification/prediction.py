@@ -105,13 +105,12 @@ def deeper_stars(
     index, direction_icrf = visible(deeper, index, time_ns, velocity_m_s, site)
     camera_from_icrf, _ = Rotation.align_vectors(about.direction_camera, about.direction_icrf)
     direction_camera = camera_from_icrf.apply(direction_icrf.reshape(-1, 3))
-    ahead = direction_camera[:, 2] > 0.0
-    xy_px = project(camera, direction_camera[ahead])
+    xy_px = project(camera, direction_camera)
     expected_px = project(camera, about.direction_camera)
     distance_px, nearest = cKDTree(expected_px).query(np.nan_to_num(xy_px, nan=-1e6))
     xy_px = xy_px + (about.xy_px - expected_px)[nearest]
     reached = distance_px < reach_px
-    return xy_px[reached], deeper.magnitude[index][ahead][reached]
+    return xy_px[reached], deeper.magnitude[index][reached]
 
 
 def visible(
@@ -172,7 +171,7 @@ def fit_warp(
     residual = measured_px - predicted_px
     coefficients: Floats = np.zeros((A.shape[1], 2))
     coefficients[0] = medians(residual)
-    scatter = 1.0
+    scatter = math.inf
     for _ in range(8):
         left = residual - A @ coefficients
         size = np.hypot(left[:, 0], left[:, 1])

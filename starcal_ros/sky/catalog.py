@@ -47,6 +47,7 @@ ANGLE_UNIT_RAD = 2 * math.pi / 2**32  # 0.3 mas
 MOTION_UNIT_RAD = 1e-5 * ARCSECOND_RAD  # 0.01 mas
 PARALLAX_UNIT_RAD = 2e-5 * ARCSECOND_RAD  # 0.02 mas
 MAGNITUDE_UNIT = 1e-3
+_ROUNDING_MAG = 1e-9  # of a magnitude in units: a star at the limit is within it
 NO_COLOUR = -32768
 
 # Largest separation of a close pair.
@@ -263,7 +264,7 @@ def _read(path: Path, magnitude_limit: float | None) -> StarCatalog:
     if magnitude_limit is None:
         return _scaled(columns, digest)
     limits = np.array([magnitude_limit, magnitude_limit + DEEPER_MAG])
-    limits = np.floor(limits / MAGNITUDE_UNIT + 1e-6)
+    limits = np.floor((limits + _ROUNDING_MAG) / MAGNITUDE_UNIT)
     count, most = np.searchsorted(columns['magnitude'], limits, side='right').tolist()
     catalog, deeper = (
         _scaled({name: column[rows] for name, column in columns.items()}, digest)
@@ -321,7 +322,7 @@ def cone(
     axis, chord = direction_icrs / np.linalg.norm(direction_icrs), _chord_with_margin(radius_rad)
     rows = np.sort(np.array(catalog.tree.query_ball_point(axis, chord), np.intp))
     if magnitude_limit is not None:
-        rows = rows[catalog.magnitude[rows] <= magnitude_limit]
+        rows = rows[catalog.magnitude[rows] <= magnitude_limit + _ROUNDING_MAG]
     return rows
 
 

@@ -106,7 +106,7 @@ def test_images_are_grouped_by_their_time_in_any_order() -> None:
     ensemble = true_observations(given)
     turned = Ensemble(tuple(reversed(ensemble.images)))
     one, other = (
-        [bin.normalised for bin in bins_of(given, images) if bin.by == 'image']
+        [one.normalised for one in bins_of(given, images) if one.by == 'image']
         for images in (ensemble, turned)
     )
     assert len(one) > 1 and one == pytest.approx(other, rel=1e-6)

@@ -14,6 +14,7 @@ from starcal_ros.identification.prediction import (
     Prediction,
     warp_degree,
 )
+from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
 from starcal_ros.sky.catalog import load_catalog
 
 SCENARIO = scenario('tiny', seed=6)
@@ -71,6 +72,18 @@ def test_a_polynomial_is_found_among_outliers() -> None:
     assert np.abs(correction - bent(at_px)).max() < 0.14
     # The sigma per axis, to 10 % from 200 stars; the outliers lift it by as much at most.
     assert 0.08 < scatter_px < 0.12
+
+
+def test_a_polynomial_is_found_whatever_its_size() -> None:
+    predicted_px = np.random.default_rng(3).uniform(0, 2 * HALF_PX, (200, 2))
+    shift = bent(predicted_px) - np.median(bent(predicted_px), axis=0)
+    one_px = shift / (np.median(np.hypot(*shift.T)) * RAYLEIGH_TO_SIGMA)
+    for size in (0.5, 1.0, 2.0):
+        measured_px = predicted_px + size * one_px
+        given = predicted_px, measured_px, np.full(200, 0.1), predicted_px, HALF_PX
+        assert (
+            np.abs(fit_warp(*given)[0] - size * one_px).max() < 1e-3 and fit_warp(*given)[1] < 0.02
+        )
 
 
 @pytest.mark.parametrize(('stars', 'degree'), [(4, 0), (12, 1), (36, 3), (150, 5)])
