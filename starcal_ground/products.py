@@ -170,7 +170,7 @@ def read_residuals(path: Path) -> Residuals:
     >>> import starcal_ground
     >>> residuals = starcal_ground.read_residuals(Path('out/residuals.npz'))
     >>> residuals.residual_px.shape, int(residuals.used.sum())  # measured minus predicted
-    ((2997, 2), 2996)
+    ((2996, 2), 2996)
     """
     with errors_as(ProductError, path):
         names = ('format', *(field.name for field in fields(Residuals)))
