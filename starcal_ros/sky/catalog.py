@@ -47,7 +47,7 @@ ANGLE_UNIT_RAD = 2 * math.pi / 2**32  # 0.3 mas
 MOTION_UNIT_RAD = 1e-5 * ARCSECOND_RAD  # 0.01 mas
 PARALLAX_UNIT_RAD = 2e-5 * ARCSECOND_RAD  # 0.02 mas
 MAGNITUDE_UNIT = 1e-3
-_ROUNDING_MAG = 1e-9  # of a magnitude in units: a star at the limit is within it
+_ROUNDING_MAG = 1e-9  # a star at the limit is within it, however its magnitude is rounded
 NO_COLOUR = -32768
 
 # Largest separation of a close pair.
