@@ -80,6 +80,6 @@ def attitude_by_stars(calibration: Calibration, image: StarObservations) -> Star
     information = np.einsum('n,nij->ij', weight, np.eye(3) - along)
     # Three angles of two components of each star follow its residual.
     freedom = 2.0 - 3.0 / np.count_nonzero(used)
-    of_axis = used / variance_px2 * (off**2 / freedom - variance_px2)
-    own_px2 = max(float(of_axis.sum() / (used / variance_px2).sum()), 0.0)
+    beyond_px2 = off[used] ** 2 / freedom - variance_px2[used]
+    own_px2 = max(float(np.average(beyond_px2, weights=1.0 / variance_px2[used])), 0.0)
     return StarAttitude(rotation, np.linalg.inv(information), own_px2)
