@@ -234,7 +234,7 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[
     """
     rng = np.random.default_rng(4)
     n = len(given.table)
-    from_sky = Rotation.from_euler('z', rng.uniform(0.0, 6.0, n)).as_matrix()[:, :2, :2]
+    from_sky = Rotation.from_euler('z', rng.uniform(0.0, 6.0, (n, 1))).as_matrix()[:, :2, :2]
     used = given.keep
     cells = np.where(used, rng.integers(0, 9, n), -1)
     star = np.where(used, given.table.star, -1)

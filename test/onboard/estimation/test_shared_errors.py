@@ -152,7 +152,7 @@ def campaign(
     star = np.tile(np.arange(n), m)
     pixels = rng.uniform(0.0, WIDTH - 1.0, (m * n, 2))
     angle = np.repeat(rng.uniform(0.0, 2.0 * np.pi, m), n)
-    from_sky = Rotation.from_euler('z', angle).as_matrix()[:, :2, :2]
+    from_sky = Rotation.from_euler('z', angle[:, None]).as_matrix()[:, :2, :2]
     place = place_px * rng.normal(size=(n, 2))
     residual = noise_px * rng.normal(size=(m * n, 2))
     residual += np.einsum('nij,nj->ni', from_sky, place[star])
