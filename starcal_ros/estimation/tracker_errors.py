@@ -145,9 +145,7 @@ def tracker_errors(
     prior = noise_prior + slow_prior.log_density(_LOG_SLOW[:, None])
     of_group = np.stack([np.bincount(group, one) for one in error.T], axis=1) / size[:, None]
     within = float(((error - of_group[group]) ** 2).sum())
-    log_likelihood, mean_information = [], []
-    plain = -math.inf
-    log_share = np.log(correlations.weight)[:, None, None]
+    found, mean_information = [], []
     for K, axes in zip(correlations.kernels, correlations.axes, strict=True):
         likelihood, information = _restricted(*axes, of_group, slow2, noise2, of_stars, m / len(K))
         # Within a group there is noise, and the slow error that its members do not share.
@@ -155,10 +153,10 @@ def tracker_errors(
             apart = m / (m - len(K)) * (1.0 - float(size @ np.diag(K)) / m)
             alone = slow2 * max(apart, 0.0) + noise2 + of_stars
             likelihood = likelihood - 0.5 * (count * (m - len(K)) * np.log(alone) + within / alone)
-        log_likelihood.append(likelihood)
+        found.append(likelihood)
         mean_information.append(information)
-        plain = max(plain, float(likelihood[0].max()))
-    by_prior = np.array(log_likelihood) + prior + log_share
+    log_likelihood = np.array(found)
+    by_prior = log_likelihood + prior + np.log(correlations.weight)[:, None, None]
     weight = np.exp(by_prior - by_prior.max())
     weight /= weight.sum()
     noise = float(weight.sum(axis=(0, 1)) @ noise2)
@@ -171,7 +169,7 @@ def tracker_errors(
     shrunk = min(of_mean**2 / mean_variance, 1.0)
     covariance *= shrunk
     best = int(np.argmax(weight.sum(axis=(1, 2))))
-    ratio = float(np.max(log_likelihood)) - plain
+    ratio = float(log_likelihood.max() - log_likelihood[:, 0].max())
     return TrackerErrors(
         noise=math.sqrt(noise),
         slow=math.sqrt(float(per_kernel.sum())),
