@@ -17,7 +17,9 @@ import pytest
 from starcal_ground import directions_icrf
 from starcal_ground.bags.reader import read_observations
 from starcal_ground.mission.export.export_formats import export
+from starcal_ground.mission.export.image_attitude import attitude_by_stars
 from starcal_ground.mission.export.request import Request
+from starcal_ground.mission.export.wcs import _system
 from starcal_ground.products import OBSERVATIONS_FILE, OBSERVATIONS_TOPIC
 from starcal_ground.simulation.scenario import scenario, scene
 from starcal_ground.undistortion import straight_camera
@@ -113,19 +115,21 @@ def test_directions_are_those_of_pixels_by_three_stars(tiny, images) -> None:
 
 
 @pytest.mark.filterwarnings('ignore::astropy.wcs.FITSFixedWarning')
-def test_stars_in_a_corner_of_an_image_bend_no_coordinates_in_the_others(
-    tiny, images, tmp_path
-) -> None:
-    whole, *_ = (image for image in images if len(image) > 60)
-    near = whole.select((whole.measured_px < [[300.0, 240.0]]).all(axis=1))
-    corners, found = pixel_grid(tiny.geometry.camera, 2, 2).reshape(-1, 2), []
-    for name, image in (('whole', whole), ('near', near)):
-        done = export(tiny, 'wcs', tmp_path / name, Request(observations=[image]))
-        header = fits.Header.fromstring(next(iter(done.files.values())))
-        places = WCS(header).pixel_to_world(*corners.T).cartesian.xyz.value.T
-        found.append(places * tiny.geometry.camera.parameters[0])
-    # Few stars have the attitude to a tenth of a pixel, and the far corner is four times as far.
-    assert np.abs(found[0] - found[1]).max() < 0.5
+def test_stars_in_a_quarter_of_an_image_bend_no_coordinates_in_the_others(tiny, images) -> None:
+    camera, catalog = tiny.geometry.camera, load_catalog(None)
+    corners = pixel_grid(camera, 2, 2).reshape(-1, 2)
+    for whole in images:
+        attitude = attitude_by_stars(tiny, whole)
+        assert attitude is not None
+        near = whole.select((whole.measured_px < [[320.0, 256.0]]).all(axis=1))
+        there, here = (
+            WCS(fits.Header(_system(tiny, image, attitude.icrf_from_camera, catalog).cards()))
+            .pixel_to_world(*corners.T)
+            .cartesian.xyz.value
+            for image in (whole, near)
+        )
+        # Both follow the aberration to 0.02 px; a cubic through 39 stars was 0.37 px off.
+        assert np.abs(there - here).max() * camera.parameters[0] < 0.05
 
 
 def test_a_field_beyond_a_gnomonic_projection_is_named(tiny, images, tmp_path) -> None:
