@@ -82,6 +82,11 @@ class ImageQueue:
         """Return the number of images waiting."""
         return len(self._images)
 
+    @property
+    def is_closed(self) -> bool:
+        """True after `close`."""
+        return self._closed
+
     def put(self, time_ns: int, width: int, height: int, message: Any) -> None:
         """Add an image; never waits."""
         with self._changed:

@@ -44,7 +44,8 @@ _IMAGES = 20  # images that wait with their pixels: 200 MB at 5 megapixels and 1
 _SAMPLES = QoSProfile(depth=2000)
 _COMPARED = 8  # velocities with that of the Earth: 1 ms, once a second
 _STAMP_NS = operator.itemgetter(0)
-_DISCOVERY_S = 1.5  # 15 of the 20 images that wait, at 10 Hz
+_DISCOVERY_S = 5.0  # an announcement that is lost on a busy machine is repeated after 3 s
+_MOST_UNDISCOVERED = 3 * _IMAGES // 4  # waiting images: the others are room for the next
 # Attitudes of an hour take 2 MB at 10 Hz, and up to two hours are held; only a recorder sends
 # later images.
 _HISTORY_S = 3600.0
@@ -312,14 +313,11 @@ class StarObserver(StarcalNode):
         self._queue.call(functools.partial(self.guarded(function), *arguments))
 
     def _measure_all(self) -> None:
-        ready_by_s = math.inf
+        is_first = True
         while (waiting := self._queue.take()) is not None:
-            # Where all nodes start at once, the first image may be faster than the discovery of
-            # the calibrator, and its observations would reach nobody; or than the velocity, which
-            # would then be an unknown of the calibration.
-            ready_by_s = min(ready_by_s, time.monotonic() + _DISCOVERY_S)
-            while not (self._is_heard() and self._is_told()) and time.monotonic() < ready_by_s:
-                time.sleep(0.02)  # rclpy cannot wait for a match
+            if is_first:
+                self._await_discovery()
+                is_first = False
             try:
                 self._measure(waiting)
             except Exception as error:
@@ -331,10 +329,22 @@ class StarObserver(StarcalNode):
             self._latency_s.add(time.monotonic() - waiting.arrived_s)
             self.guarded(self.publish_health_change)()
 
+    def _await_discovery(self) -> None:
+        """
+        Wait until the others are discovered, or images would be lost.
+
+        Where all nodes start at once, the first image may be faster than the discovery of the
+        calibrator, and its observations would reach nobody; or than the velocity, which would then
+        be an unknown of the calibration.
+        """
+        until_s = time.monotonic() + _DISCOVERY_S
+        while not (self._is_heard() and self._is_told()) and time.monotonic() < until_s:
+            if self._queue.is_closed or len(self._queue) >= _MOST_UNDISCOVERED:
+                return
+            time.sleep(0.02)  # rclpy cannot wait for a match
+
     def _is_heard(self) -> bool:
         """Return True if each subscriber that the graph shows is matched, and there is one."""
-        if not self.is_active:
-            return True
         known = self.count_subscribers(self._observations.topic_name)
         return bool(known) and self._observations.get_subscription_count() >= known
 
