@@ -21,6 +21,7 @@ import numpy as np
 import scipy
 from scipy.spatial.transform import Rotation
 
+from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Inertial, Scenario, scenario
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.lookup import line_of_sight_table
@@ -48,6 +49,13 @@ def of_random_pointings(seed: int, images: int = 12) -> Scenario:
     return dataclasses.replace(
         scenario('small', seed), pointing=pointing, image_count=images, magnitude_limit=8.0
     )
+
+
+@functools.cache
+def observed(seed: int, images: int = 12) -> tuple[Scenario, Ensemble]:
+    """Return that scenario and its observations."""
+    given = of_random_pointings(seed, images)
+    return given, true_observations(given)
 
 
 @functools.cache

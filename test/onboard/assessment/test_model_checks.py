@@ -4,18 +4,20 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
+import functools
 from typing import Any
 
 import numpy as np
 import pytest
 from worlds import (  # type: ignore[import-not-found]
+    campaign,
     displaced,
     each_image,
     estimate_of,
     estimated,
     HEIGHT,
     honesty,
+    observed,
     of_random_pointings,
     WIDTH,
 )
@@ -41,11 +43,14 @@ def amplitude(checks: ModelChecks, name: str) -> Amplitude:
     return next(o for o in checks.amplitudes if o.name == f'{name}, most likely amplitude')
 
 
-def with_cx_off(given: Scenario, off_px: float) -> Scenario:
-    """The scenario with a true principal point that is off the prior."""
-    camera = given.truth.camera
-    moved = camera.replace(cx=float(given.prior.camera.parameters[3]) + off_px)
-    return dataclasses.replace(given, truth=dataclasses.replace(given.truth, camera=moved))
+@functools.cache
+def with_cx_off(off_px: float) -> tuple[Scenario, Ensemble]:
+    """A campaign with a true principal point that is off the prior."""
+    given = of_random_pointings(8)
+    moved = given.truth.camera.replace(cx=float(given.prior.camera.parameters[3]) + off_px)
+    truth = dataclasses.replace(given.truth, camera=moved)
+    given = dataclasses.replace(given, truth=truth)
+    return given, true_observations(given)
 
 
 def test_a_sound_camera_contradicts_nothing_and_has_no_step() -> None:
@@ -55,8 +60,7 @@ def test_a_sound_camera_contradicts_nothing_and_has_no_step() -> None:
     The least of the p-values of their steps is under 1e-3 in 1 of 250 runs.
     """
     for seed in range(1, 5):
-        given = of_random_pointings(seed, images=6)
-        checks = model_checks(estimated(given, true_observations(given)))
+        checks = model_checks(estimated(*observed(seed, images=6)))
         assert {'cx', 'cy'} <= {term.name for term in checks.held}
         # NaN, of what the stars alone do not determine, is no contradiction.
         assert not any(term.significance >= 4.5 for term in checks.held)
@@ -74,8 +78,8 @@ HAS_NARROW_PRIOR = {'prior_sigma': tuple(2.0 if k in (3, 4) else 0.0 for k in ra
     [(-30.0, IS_HELD), (3.0, IS_HELD), (30.0, HAS_NARROW_PRIOR)],
 )
 def test_a_principal_point_that_is_not_where_it_is_assumed_is_named(off_px, stated) -> None:
-    given = with_cx_off(of_random_pointings(8), off_px)
-    checks = model_checks(estimated(given, true_observations(given), **stated))
+    given, ensemble = with_cx_off(off_px)
+    checks = model_checks(estimated(given, ensemble, **stated))
     cx = held(checks, 'cx')
     assert cx.assumed == pytest.approx(given.prior.camera.parameters[3], abs=1e-9)
     # A field of tenths of a pixel takes the shift, and hid it from one step of the estimate.
@@ -85,8 +89,7 @@ def test_a_principal_point_that_is_not_where_it_is_assumed_is_named(off_px, stat
 
 
 def test_a_prior_that_is_right_is_not_contradicted_and_a_weak_one_moves_nothing() -> None:
-    given = with_cx_off(of_random_pointings(8), 30.0)
-    cx = held(model_checks(estimated(given, true_observations(given))), 'cx')
+    cx = held(model_checks(estimated(*with_cx_off(30.0))), 'cx')
     assert cx.estimated - cx.assumed == pytest.approx(30.0, abs=1.5)  # the stars know it to 0.3 px
     assert cx.sigma == pytest.approx(0.03 * WIDTH, rel=0.01)  # what the prior claims
     assert cx.significance < 1.0
@@ -102,14 +105,13 @@ def test_a_velocity_that_is_wrong_beyond_its_prior_is_in_the_sigma_and_named(
     sigma_m_s: float, least_sigmas: float
 ) -> None:
     """As without a topic, and given: a camera that changes between images takes its place."""
-    given = of_random_pointings(9)
+    given, ensemble = observed(9)
 
     def moved(_: int, image: StarObservations) -> dict[str, Floats]:
         e = image.direction_icrf + WRONG_M_S / SPEED_OF_LIGHT_M_S
         return {'direction_icrf': e / np.linalg.norm(e, axis=1)[:, None]}
 
-    ensemble = each_image(true_observations(given), moved)
-    found = estimated(given, ensemble, velocity_sigma_m_s=sigma_m_s)
+    found = estimated(given, each_image(ensemble, moved), velocity_sigma_m_s=sigma_m_s)
     checks = model_checks(found)
     terms = [held(checks, f'velocity_{axis}_m_s') for axis in 'xyz']
     assert max(term.significance for term in terms) > least_sigmas
@@ -122,8 +124,7 @@ def test_a_velocity_that_is_wrong_beyond_its_prior_is_in_the_sigma_and_named(
 def test_a_time_of_readout_that_is_stated_wrong_is_named_beside_that_of_the_stars() -> None:
     """The record had the difference of both, and 0 as what is assumed."""
     world = worlds.World(rate_deg_s=0.42, row_s=20e-6, tracker_arcsec=5.0)
-    made = worlds.simulate(world, 2)
-    found = estimate_of(made, shutter='rolling', readout_s=-0.02)
+    found = estimate_of(campaign(world, 2), shutter='rolling', readout_s=-0.02)
     readout = held(model_checks(found), 'readout_s')
     assert readout.assumed == -0.02
     # By stars that know it to some milliseconds: 1024 rows of 20 us.
@@ -132,13 +133,13 @@ def test_a_time_of_readout_that_is_stated_wrong_is_named_beside_that_of_the_star
 
 
 def test_the_step_the_field_and_the_predictions_are_in_the_record() -> None:
-    given = of_random_pointings(6)
+    given, ensemble = observed(6)
 
     def ripple(pixels: Floats) -> Floats:
         x, y = 4.0 * np.pi * pixels[:, 0] / WIDTH, 3.0 * np.pi * pixels[:, 1] / WIDTH
         return 0.3 * np.stack([np.sin(x + 0.3) * np.cos(y), np.cos(x - y)], axis=-1)
 
-    checks = model_checks(estimated(given, displaced(true_observations(given), ripple)))
+    checks = model_checks(estimated(given, displaced(ensemble, ripple)))
     field = amplitude(checks, 'field')
     assert field.likelihood_ratio > 100.0
     # 0.15 px rms along u, 0.21 along v; the lens and the alignment take a part.
@@ -159,9 +160,8 @@ def breathing(ensemble: Ensemble, scales: Floats) -> Ensemble:
 
 @pytest.mark.slow
 def test_a_focal_length_that_breathes_is_estimated_image_by_image() -> None:
-    given = of_random_pointings(9)
+    given, ensemble = observed(9)
     scales = np.random.default_rng(9).normal(size=12) * 3e-4  # a quarter of a pixel in a corner
-    ensemble = true_observations(given)
     still = estimated(given, ensemble)
     found = estimated(given, breathing(ensemble, scales))
     checks = model_checks(found)
@@ -210,10 +210,10 @@ def test_a_lens_that_warms_is_no_velocity(sigma_m_s: float) -> None:
 
 def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
     """Three images with stars in a third of the detector show one component to 700 km/s."""
-    given = of_random_pointings(9, images=3)
+    given, ensemble = observed(9, images=3)
     images = tuple(
         image.select(np.abs(image.measured_px - [WIDTH / 2, HEIGHT / 2]).max(axis=1) < 200.0)
-        for image in true_observations(given).images
+        for image in ensemble.images
     )
     found = estimated(given, Ensemble(images), method='per_image', velocity_sigma_m_s=8000.0)
     terms = [term for term in model_checks(found).held if 'velocity' in term.name]
@@ -227,7 +227,7 @@ def test_a_velocity_that_takes_the_place_of_a_tilt_is_no_contradiction() -> None
 
     A field that was flat nearer to the border left 6.8 sigma to the velocity.
     """
-    tilted = partial(worlds.tilt, 0.1)
+    tilted = functools.partial(worlds.tilt, 0.1)
     lens: dict[str, Any] = {'model': 'equidistant', 'field_deg': 90.0, 'corner': -0.02}
     stars: dict[str, Any] = {'magnitude_limit': 5.3, 'zero_point_dn': 8e5, 'bright_px': 0.03}
     made = worlds.simulate(worlds.World(40, 'small', lens=tilted, **lens, **stars), 1)
@@ -244,13 +244,13 @@ def test_a_velocity_that_takes_the_place_of_a_tilt_is_no_contradiction() -> None
 def test_lines_that_are_lost_or_shifted_are_found_where_they_are(
     across: str, moved: str, place_px: float, size_px: float
 ) -> None:
-    given = of_random_pointings(7)
+    given, ensemble = observed(7)
 
     def shifted(pixels: Floats) -> Floats:
         beyond = pixels[:, 'uv'.index(across)] > place_px
         return np.outer(beyond, size_px * (np.array(['u', 'v']) == moved))
 
-    step = detector_step(estimated(given, displaced(true_observations(given), shifted)))
+    step = detector_step(estimated(given, displaced(ensemble, shifted)))
     assert (step.across, step.moved) == (across, moved) and step.p_value < 1e-6
     assert abs(step.place_px - place_px) < 0.8 * WIDTH / 97 + 2.0  # of the places, and the stars
     assert 0.3 < step.size_px / size_px < 1.0  # the field takes the rest

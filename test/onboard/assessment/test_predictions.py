@@ -5,13 +5,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import dataclasses
+import functools
 import math
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from worlds import displaced, each_image, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
+from worlds import displaced, each_image, estimated, observed, of_random_pointings, WIDTH  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
@@ -58,8 +59,7 @@ def without_image(given: Scenario, ensemble: Ensemble, k: int) -> Floats:
 
 
 def test_the_linear_step_is_the_calibration_without_the_image() -> None:
-    given = of_random_pointings(12, images=5)
-    ensemble = true_observations(given)
+    given, ensemble = observed(12, images=5)
     found = estimated(given, ensemble, variance_components=False, outlier_sigma=20.0)
     squared, expected = predicted_residuals(found)
     for k in (0, 3):
@@ -92,8 +92,7 @@ def test_an_image_is_predicted_by_the_formula_of_the_module() -> None:
 
 
 def test_a_sound_camera_is_as_predicted_in_every_part() -> None:
-    given = of_random_pointings(13, images=6)
-    bins = bins_of(given, true_observations(given))
+    bins = bins_of(*observed(13, images=6))
     assert {'radius', 'magnitude', 'image', 'cell'} <= {one.by for one in bins}
     for one in bins:
         # Twenty parts: one exceeds 3.5 sigma in 1 of 100 campaigns.  Bright stars share the error
@@ -102,8 +101,7 @@ def test_a_sound_camera_is_as_predicted_in_every_part() -> None:
 
 
 def test_images_are_grouped_by_their_time_in_any_order() -> None:
-    given = of_random_pointings(3)
-    ensemble = true_observations(given)
+    given, ensemble = observed(3, images=6)
     turned = Ensemble(tuple(reversed(ensemble.images)))
     one, other = (
         [one.normalised for one in bins_of(given, images) if one.by == 'image']
@@ -113,8 +111,7 @@ def test_images_are_grouped_by_their_time_in_any_order() -> None:
 
 
 def test_few_images_are_not_predicted() -> None:
-    given = of_random_pointings(13, images=3)
-    assert bins_of(given, true_observations(given)) == []
+    assert bins_of(*observed(13, images=3)) == []
 
 
 def torn(ensemble: Ensemble, size_px: float = 0.3) -> Ensemble:
@@ -164,8 +161,8 @@ FAULTS: dict[str, tuple[str, Callable[[Ensemble], Ensemble]]] = {
 
 @pytest.mark.parametrize('fault', FAULTS)
 def test_a_fault_is_seen_in_its_part(fault: str) -> None:
-    given, (by, made) = of_random_pointings(16, images=12), FAULTS[fault]
-    bins = bins_of(given, made(true_observations(given)))
+    (given, ensemble), (by, made) = observed(16), FAULTS[fault]
+    bins = bins_of(given, made(ensemble))
     worst, of_kind = worst_of(bins), [one for one in bins if one.by == by]
     assert worst.by == by and worst.normalised > 1.0 + 5.0 * worst.sigma
     if by in ('radius', 'image'):
@@ -174,8 +171,7 @@ def test_a_fault_is_seen_in_its_part(fault: str) -> None:
 
 def test_without_a_fault_no_part_stands_apart() -> None:
     """Nor do faint stars of a wrong noise, since a change with magnitude is estimated."""
-    given = of_random_pointings(16, images=12)
-    ensemble = true_observations(given)
+    given, ensemble = observed(16)
     worst = worst_of(bins_of(given, ensemble))
     assert worst.normalised < 1.0 + 3.5 * worst.sigma
     noisy = scattered(ensemble, lambda _, image: image.magnitude > 7.5)
@@ -193,13 +189,13 @@ def test_few_images_of_a_lens_with_structure_are_predicted() -> None:
     Less an image, the information of the average over the amplitudes is nearly singular.  At the
     most likely ones an image with a shape of its own still stands apart.
     """
-    given = of_random_pointings(21, images=5)
+    given, ensemble = observed(21, images=5)
 
     def move(pixels: Floats) -> Floats:
         half_widths = (pixels - MIDDLE_PX) / (WIDTH / 2.0)
         return ripple(0.15, 14.0, np.random.default_rng(21), half_widths)
 
-    ensemble = displaced(true_observations(given), move)
+    ensemble = displaced(ensemble, move)
     sound = of_images(bins_of(given, ensemble))
     assert len(sound) >= 11
     assert all(0.85 < one.normalised < 1.15 for one in sound)
@@ -208,6 +204,7 @@ def test_few_images_of_a_lens_with_structure_are_predicted() -> None:
     assert worst.normalised > 1.2
 
 
+@functools.cache
 def of_three_fields() -> tuple[Scenario, Ensemble]:
     """Fifteen images of three fields, whose catalog places are off by 0.1 px."""
     given = of_random_pointings(17, images=3)

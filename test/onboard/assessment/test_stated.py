@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from sample_records import model_checks  # type: ignore[import-not-found]
 from scipy.spatial.transform import Rotation
-from worlds import campaign, estimated, honesty, of_random_pointings, options_of, solved  # type: ignore[import-not-found]
+from worlds import campaign, estimated, honesty, observed, options_of, solved  # type: ignore[import-not-found]
 
-from starcal_ground.simulation.centroids import true_observations
 from starcal_ros.arrays import Floats
 from starcal_ros.assessment.gate import GateOptions, model_gate, reasons_of
 from starcal_ros.assessment.model_checks import check_sigmas
@@ -27,8 +26,6 @@ from starcal_ros.sky.catalog import load_catalog
 from studies.worlds import World
 
 CATALOG = load_catalog(None, 8.0)
-GIVEN = of_random_pointings(9)
-ENSEMBLE = true_observations(GIVEN)  # each minute an image, with the velocity of the Earth
 TURN_RAD_S = np.array([0.0, 1e-3, 0.0])  # 3.4 degrees from image to image
 Changed = Callable[[StarObservations], StarObservations]
 
@@ -66,7 +63,7 @@ def turning(factor: float) -> Changed:
     """Attitudes that turn evenly, with that rate times a factor."""
 
     def changed(image: StarObservations) -> StarObservations:
-        late_s = 1e-9 * (image.time_ns - ENSEMBLE.images[0].time_ns)
+        late_s = 1e-9 * since_1970(image).time_ns
         attitude = Rotation.from_rotvec(TURN_RAD_S * late_s).as_quat()
         rate = factor * TURN_RAD_S
         return dataclasses.replace(
@@ -94,7 +91,9 @@ def of_one_star(image: StarObservations) -> StarObservations:
 
 
 def since_1970(image: StarObservations) -> StarObservations:
-    return dataclasses.replace(image, time_ns=image.time_ns - ENSEMBLE.images[0].time_ns)
+    """Stamps that count from the first image: one a minute."""
+    _, ensemble = observed(9)
+    return dataclasses.replace(image, time_ns=image.time_ns - ensemble.images[0].time_ns)
 
 
 def as_it_is(image: StarObservations) -> StarObservations:
@@ -102,7 +101,8 @@ def as_it_is(image: StarObservations) -> StarObservations:
 
 
 def changed_by(change: Changed) -> Ensemble:
-    return Ensemble(tuple(map(change, ENSEMBLE.images)))
+    """Observations with the velocity of the Earth, changed."""
+    return Ensemble(tuple(map(change, observed(9)[1].images)))
 
 
 @pytest.mark.parametrize(
@@ -190,12 +190,10 @@ def test_a_velocity_of_the_wrong_sign_is_in_the_sigma(velocity: str) -> None:
     doubted = with_doubts(changed_by(stating(velocity)), CATALOG)
     (sigma_m_s,) = {image.velocity_sigma_m_s for image in doubted.images}
     assert 55e3 < sigma_m_s < 80e3  # twice the velocity
-    found = estimated(GIVEN, doubted, velocity_sigma_m_s=-1.0)
-    assert honesty(GIVEN, found, np.zeros_like)[0] < 2.0
-
-
-def test_a_right_velocity_keeps_its_sigma() -> None:
-    assert with_doubts(ENSEMBLE, CATALOG) is ENSEMBLE
+    given, right = observed(9)
+    found = estimated(given, doubted, velocity_sigma_m_s=-1.0)
+    assert honesty(given, found, np.zeros_like)[0] < 2.0
+    assert with_doubts(right, CATALOG) is right
 
 
 def test_what_the_stars_alone_do_not_determine_is_not_checked() -> None:
