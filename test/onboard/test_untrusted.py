@@ -111,8 +111,7 @@ documents = st.recursive(
 )
 
 
-@pytest.mark.slow
-@settings(max_examples=200)
+@settings(max_examples=100)
 @given(documents)
 def test_what_the_libraries_write_comes_back(value: object) -> None:
     assert yaml_value(yaml.safe_dump(value)) == value
