@@ -19,7 +19,7 @@ from starcal_ros.camera import pixel_grid
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import equations
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart
+from starcal_ros.records import BUDGET_COLUMNS, BUDGET_ROWS, SigmaPart, Statement
 from studies.worlds import World
 
 RAM = World(pointing='ram', velocity_m_s=1.0)  # pointings on one side of the sky
@@ -98,10 +98,10 @@ def test_velocity_is_the_fall_of_an_estimate_that_is_given_it() -> None:
 
 def test_a_held_parameter_is_the_fall_of_an_estimate_that_holds_it_exactly() -> None:
     kept = ('fx', 'skew', 'fy', 'cx', 'cy', 'k1', 'k2', 'p1', 'p2')
-    sigma = [0.0] * 10
-    exact = parts(RAM, estimate=kept, prior_sigma=tuple(sigma))
-    sigma[7] = 2.0
-    loose = parts(RAM, estimate=kept, prior_sigma=tuple(sigma))
+    exact, loose = (
+        parts(RAM, estimate=kept, prior_sigma=(*[0.0] * 7, sigma, 0.0, 0.0))
+        for sigma in (0.0, 2.0)
+    )
     assert 'held parameters' not in exact
     part = loose['held parameters']
     of_map, of_pointing = fall(loose['total'], exact['total'])
@@ -119,6 +119,8 @@ def test_places_of_stars_are_the_fall_of_a_campaign_without_their_errors() -> No
     assert part.map_arcsec > 0.5 * parts(FIELDS)['total'].map_arcsec
     # That estimate has other weights: the part is of those that allow for the errors.
     assert part.map_arcsec == pytest.approx(math.sqrt(of_map**2 - of_structure**2), rel=0.25)
+    # Errors that no two observations share are noise.
+    assert parts(World(3))['star places'].map_arcsec == 0.0
 
 
 def test_a_slow_error_is_the_fall_of_an_estimate_that_has_none() -> None:
@@ -158,20 +160,18 @@ def test_without_rates_the_shutter_is_asked_for_or_where_it_rolls_the_rates() ->
     ensemble = each_image(made.ensemble, lambda *_: {'star_tracker_rate_rad_s': unknown})
     made = dataclasses.replace(made, ensemble=ensemble)
 
-    def estimated(**stated: Any) -> tuple[Estimate, CalibrationOptions]:
-        return estimate_of(made, **stated), options_of(made.scenario, **stated)
+    def asked(**stated: Any) -> tuple[tuple[SigmaPart, ...], tuple[Statement, ...]]:
+        found = estimate_of(made, **stated), options_of(made.scenario, **stated)
+        budget = sigma_budget(*found)
+        return budget, statements(budget, *found)
 
-    def total(found: tuple[Estimate, CalibrationOptions]) -> SigmaPart:
-        return next(part for part in sigma_budget(*found) if part.cause == 'total')
-
-    still = total(estimated(shutter='global')).map_arcsec
+    still = {part.cause: part for part in asked(shutter='global')[0]}['total'].map_arcsec
     rates = 'star_tracker_rate_rad_s of the images'
     for stated, option in (
         ({}, f'shutter, or {rates}'),
         ({'shutter': 'rolling', 'readout_s': 0.02}, rates),
     ):
-        found = estimated(**stated)
-        row = next(r for r in statements(sigma_budget(*found), *found) if r.option == option)
+        row = next(row for row in asked(**stated)[1] if row.option == option)
         assert row.scope == 'camera' and row.before_arcsec > 3.0 * row.after_arcsec
         assert row.after_arcsec == pytest.approx(still, rel=0.1)  # as of other statements
 
@@ -216,10 +216,6 @@ def test_known_shapes_add_the_information_that_they_hide() -> None:
     np.testing.assert_allclose(back, C / np.outer(size, size), atol=1e-6)
     part = parts(breathing)['change from image to image']
     assert part.map_arcsec > 0.5 * parts(breathing)['total'].map_arcsec
-
-
-def test_an_error_that_no_two_observations_share_is_noise() -> None:
-    assert parts(World(3))['star places'].map_arcsec == 0.0
 
 
 def test_without_an_alignment_no_star_tracker_is_a_cause() -> None:

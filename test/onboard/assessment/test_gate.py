@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 from starcal_ros.assessment.gate import GateOptions, judge, reasons_of
 from starcal_ros.assessment.lookup import movement
 from starcal_ros.camera import CameraModel
+from starcal_ros.camera.projection import convert
 from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.estimation.problem import camera_at
 from starcal_ros.options import names_of
@@ -226,8 +227,7 @@ def test_each_limit_of_a_change_trips_alone(limit, geometry, active, expected, r
     # A change from the prior may be larger, as far as it is documented.
     more, factor, note = OF_THE_PRIOR[limit] if active is None else (0.0, 1.0, '')
     value = (check.found - more) / factor
-    limits: list[dict[str, Any]] = [{limit: value * (1 + 1e-12)}, {limit: 0.99 * value}]
-    at_limit, beyond = (GateOptions(**row) for row in limits)
+    at_limit, beyond = (GateOptions(**{limit: value * share}) for share in (1 + 1e-12, 0.99))
     assert reasons(found, at_limit, active) == ()
     assert checks(found, at_limit, active)[limit].note == note
     (reason,) = reasons(found, beyond, active)
@@ -261,36 +261,24 @@ def test_the_remaining_images_must_be_enough() -> None:
 
 
 def test_an_active_calibration_of_another_lens_model_is_compared_too() -> None:
-    rational = CameraModel(
-        640, 512, np.r_[CAMERA.parameters, 0.0, 0.0, 0.0], 'rational_polynomial'
-    )
+    rational, _ = convert(CAMERA, 'rational_polynomial')
     geometry = CameraGeometry(rational, PRIOR.star_tracker_from_camera_xyzw)
     active = dataclasses.replace(GOOD, geometry=geometry, covariance=np.zeros((16, 16)))
-    check = checks(dataclasses.replace(GOOD, geometry=LONGER), GateOptions(), active)[
-        'max_change_px'
-    ]
-    assert check.found == pytest.approx(3.916, rel=0.05)
+    found = checks(dataclasses.replace(GOOD, geometry=LONGER), GateOptions(), active)
+    assert found['max_change_px'].found == pytest.approx(3.916, rel=0.05)
 
 
 def test_a_change_is_that_at_one_temperature() -> None:
     """A focal length that grows with temperature has not changed between two references."""
     terms = TemperatureTerms(20.0, (1e-3,), (1e-5,), (1e-5, 2e-5, 0.0), (1e-6,) * 3)
     active = dataclasses.replace(GOOD, temperature=terms)
-    warm = dataclasses.replace(
-        GOOD,
-        geometry=camera_at(active, 50.0),
-        temperature=dataclasses.replace(terms, reference_degc=50.0),
-    )
+    at_50 = dataclasses.replace(terms, reference_degc=50.0)
+    warm = dataclasses.replace(GOOD, geometry=camera_at(active, 50.0), temperature=at_50)
     # The two limits are one row: the one with the larger share of its limit.
     (change,) = (row for row in judged(warm, GateOptions(), active) if row.option in PAIR)
     assert change.found < 1e-6
     # Without terms it has: the limits see it.
     assert {*limits_in(reasons(warm, GateOptions(), GOOD))} & {*PAIR}
-
-
-def test_a_calibration_without_maps_cannot_be_judged() -> None:
-    with pytest.raises(ValueError, match='needs its detector maps'):
-        judged(dataclasses.replace(GOOD, maps=None), GateOptions())
 
 
 PAIR = ('max_change_px', 'max_rotation_deg')
@@ -308,6 +296,10 @@ def test_every_limit_has_its_check() -> None:
     for name in names_of(GateOptions) & found.keys() - {'requirements'}:
         assert found[name].limit == getattr(GateOptions(), name)
     assert 'p-value 0.7' in found['max_detector_step_px'].note
+    of_a_message = checks(dataclasses.replace(GOOD, model_checks=None), GateOptions())
+    assert not {'max_detector_step_px', 'max_image_variation_px'} & {*of_a_message}
+    with pytest.raises(ValueError, match='needs its detector maps'):
+        judged(dataclasses.replace(GOOD, maps=None), GateOptions())
 
 
 @pytest.mark.parametrize('lens', [20.0, 100.0])
@@ -341,11 +333,6 @@ def parts(normalised: float, sigma: float) -> tuple[ResidualBin, ...]:
 )
 def test_what_noise_explains_passes_beyond_its_limit(changes: dict[str, Any]) -> None:
     assert reasons(dataclasses.replace(GOOD, **changes), GateOptions()) == ()
-
-
-def test_a_calibration_of_a_message_has_no_checks_of_the_model() -> None:
-    found = checks(dataclasses.replace(GOOD, model_checks=None), GateOptions())
-    assert 'max_detector_step_px' not in found and 'max_image_variation_px' not in found
 
 
 def test_a_search_that_did_not_converge_is_refused() -> None:

@@ -59,13 +59,6 @@ def differences(camera: CameraModel, pixels: np.ndarray, change: np.ndarray) -> 
 
 
 @CAMERAS
-def test_directions_are_those_of_the_camera(camera: CameraModel) -> None:
-    table = line_of_sight_table(camera, MapCovariance(covariance_of(camera)), PIXELS)
-    np.testing.assert_array_equal(table.pixels, PIXELS)
-    np.testing.assert_array_equal(table.direction_camera, line_of_sight(camera, PIXELS))
-
-
-@CAMERAS
 def test_derivatives_are_the_limits_of_differences(camera: CameraModel) -> None:
     J = Derivatives.at(camera, PIXELS).J
     sigma = np.sqrt(np.diag(covariance_of(camera)))
@@ -78,13 +71,15 @@ def test_derivatives_are_the_limits_of_differences(camera: CameraModel) -> None:
 
 
 @CAMERAS
-def test_sigma_is_that_of_differences(camera: CameraModel) -> None:
+def test_directions_are_those_of_the_camera_and_sigmas_those_of_differences(camera) -> None:
     """Sum of the squared movements by independent changes; common rotation by least squares."""
     covariance = covariance_of(camera)
     table = line_of_sight_table(camera, MapCovariance(covariance), PIXELS)
     p = len(camera.parameters)
     both = pixel_grid(camera, 25, 25)
     at_grid, at_pixels = line_of_sight(camera, both), line_of_sight(camera, PIXELS)
+    np.testing.assert_array_equal(table.pixels, PIXELS)
+    np.testing.assert_array_equal(table.direction_camera, at_pixels)
     whole, shape = np.zeros(len(PIXELS)), np.zeros(len(PIXELS))
     small = 1e-4  # of a 1-sigma: its rotation is linear in it
     # Columns of a square root of the covariance move the camera independently of each other.
@@ -97,11 +92,7 @@ def test_sigma_is_that_of_differences(camera: CameraModel) -> None:
         common = (turn.apply(at_pixels) - at_pixels) / small
         left = differences(camera, PIXELS, change) - common
         shape += (left**2).sum(axis=1)
-    np.testing.assert_allclose(
-        table.sigma_arcsec,
-        np.sqrt(whole) / ARCSECOND_RAD,
-        rtol=RTOL,
-    )
+    np.testing.assert_allclose(table.sigma_arcsec, np.sqrt(whole) / ARCSECOND_RAD, rtol=RTOL)
     np.testing.assert_allclose(table.shape_sigma_arcsec, np.sqrt(shape) / ARCSECOND_RAD, rtol=1e-5)
 
 

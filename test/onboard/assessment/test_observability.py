@@ -87,24 +87,25 @@ def test_predicted_sigma_at_the_truth_is_the_cramer_rao_bound() -> None:
     np.testing.assert_allclose(found, bound, rtol=0.01)
 
 
-def test_a_first_star_tracker_without_images_leaves_the_camera_known() -> None:
-    images = tuple(dataclasses.replace(one, star_tracker='second') for one in ensemble().images)
-    sigma = predicted_sigma(Ensemble(images), PRIOR, OPTIONS)
-    assert np.isfinite(sigma[:-3]).all()
+def of_stars(*counts: int) -> Ensemble:
+    """Images of the first stars of one."""
+    first = ensemble().images[0]
+    return Ensemble(tuple(first.select(np.arange(len(first)) < count) for count in counts))
 
 
 def test_what_cannot_be_known_is_infinite() -> None:
-    assert np.isinf(predicted_sigma(Ensemble(), PRIOR, OPTIONS)).all()
-    first = ensemble().images[0]
-    for count in (0, 1, 2, 3):
-        few = Ensemble((first.select(np.arange(len(first)) < count),))
-        sigma = predicted_sigma(few, PRIOR, OPTIONS)
-        assert np.isinf(sigma).all(), count
+    for few in (Ensemble(), *map(of_stars, range(4))):
+        assert np.isinf(predicted_sigma(few, PRIOR, OPTIONS)).all(), few
+    # A wrong alignment by 180 degrees must not pass for a perfect calibration.
+    behind = turned(PRIOR, Rotation.from_euler('x', 180, degrees=True))
+    assert np.isinf(predicted_sigma(ensemble(), behind, OPTIONS)).all()
+    # A first star tracker without images leaves the camera known.
+    images = tuple(dataclasses.replace(one, star_tracker='second') for one in ensemble().images)
+    assert np.isfinite(predicted_sigma(Ensemble(images), PRIOR, OPTIONS)[:-3]).all()
 
 
 def test_images_of_fewer_than_three_stars_tell_nothing() -> None:
-    first = ensemble().images[0]
-    images = tuple(first.select(np.arange(len(first)) < n) for n in (0, 2, 3, 50))
+    images = of_stars(0, 2, 3, 50).images
     information = image_information(images, PRIOR, OPTIONS)
     assert not information[:2].any()
     assert (np.diag(information[2]) > 0).all()
@@ -138,9 +139,8 @@ def test_coverage_equals_counting() -> None:
     camera = PRIOR.camera
     u, v = camera.width - 0.51, camera.height - 0.51
     corners = np.array([[-0.49, -0.49], [u, -0.49], [-0.49, v], [u, v]])
-    first = ensemble().images[0]
-    first = first.select(np.arange(len(first)) < 4)
-    images = *ensemble().images, dataclasses.replace(first, measured_px=corners)
+    (four,) = of_stars(4).images
+    images = *ensemble().images, dataclasses.replace(four, measured_px=corners)
     expected = np.zeros((8, 10), int)
     for u, v in np.concatenate([image.measured_px for image in images]):
         expected[int((v + 0.5) / camera.height * 8), int((u + 0.5) / camera.width * 10)] += 1
@@ -249,22 +249,10 @@ def test_the_weakest_direction_is_named_with_its_loss() -> None:
     assert alone.endswith('(+1.00), uncorrelated with the others')
 
 
-def test_an_ensemble_within_its_limit_is_not_touched() -> None:
-    limit = dataclasses.replace(OPTIONS, max_images=10)
-    assert keep_most_informative(ensemble(), PRIOR, limit).images == ensemble().images
-
-
-def test_images_are_let_go_before_anything_is_observable() -> None:
-    first = ensemble().images[0]
-    images = tuple(first.select(np.arange(len(first)) < n) for n in (1, 0, 3, 1, 4))
+def test_images_are_let_go_beyond_the_limit_before_anything_is_observable() -> None:
+    kept = keep_most_informative(ensemble(), PRIOR, dataclasses.replace(OPTIONS, max_images=10))
+    assert kept.images == ensemble().images
     limit = dataclasses.replace(OPTIONS, max_images=3)
-    kept = keep_most_informative(Ensemble(images), PRIOR, limit)
+    kept = keep_most_informative(of_stars(1, 0, 3, 1, 4), PRIOR, limit)
     assert [len(image) for image in kept.images][-1] == 4
     assert 3 in [len(image) for image in kept.images]
-
-
-def test_a_prior_that_sees_the_stars_behind_it_says_nothing() -> None:
-    # A wrong alignment by 180 degrees must not pass for a perfect calibration.
-    behind = turned(PRIOR, Rotation.from_euler('x', 180, degrees=True))
-    sigma = predicted_sigma(ensemble(), behind, OPTIONS)
-    assert np.isinf(sigma).all()

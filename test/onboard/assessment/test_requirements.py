@@ -148,12 +148,12 @@ def test_the_reason_that_a_requirement_is_missed_has_at_most_200_characters() ->
         assert all(reason.endswith(remedy_against(cause) or 'arcsec') for reason in reasons)
 
 
-@pytest.mark.parametrize('held', [0, 2])
-def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
-    covariance = FOUND.covariance.copy()
-    covariance[held, held] = 0.0
-    one_held = dataclasses.replace(FOUND, covariance=covariance)
-    assert np.isnan(Requirement.of('f=1px').sigma(one_held))
+def test_one_focal_length_that_is_held_is_no_sigma_of_both() -> None:
+    for held in (0, 2):
+        covariance = FOUND.covariance.copy()
+        covariance[held, held] = 0.0
+        one_held = dataclasses.replace(FOUND, covariance=covariance)
+        assert np.isnan(Requirement.of('f=1px').sigma(one_held))
 
 
 @pytest.mark.parametrize(
@@ -173,16 +173,16 @@ def test_one_focal_length_that_is_held_is_no_sigma_of_both(held: int) -> None:
     ],
 )
 def test_what_is_not_understood_is_named(text: str, words: str) -> None:
-    for texts in ([text], ['map=1px', text]):
+    """A word states that there is none; beside others it is not understood."""
+    assert requirements_of(['none']) == ()
+    for texts, said in (
+        ([text], words),
+        (['map=1px', text], words),
+        (['none', 'map=1px'], 'none'),
+    ):
         with pytest.raises(OptionError, match='^requirements: ') as refused:
             requirements_of(texts)
-        assert words in str(refused.value)
-
-
-def test_no_requirement_is_stated_by_a_word() -> None:
-    assert requirements_of(['none']) == ()
-    with pytest.raises(OptionError, match='none'):
-        requirements_of(['none', 'map=1px'])
+        assert said in str(refused.value)
 
 
 OPTIONS = names_of(*OPTION_CLASSES, *NODE_OPTION_CLASSES)
