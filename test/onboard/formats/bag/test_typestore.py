@@ -69,11 +69,10 @@ def test_others_are_refused(definition: str, why: str) -> None:
             read(raw)
 
 
-@pytest.mark.parametrize('text', ['', '# of the file\n\n{}'])
-def test_a_definition_that_differs_in_words_is_that_of_this_version(text: str) -> None:
+def test_a_definition_that_differs_in_words_is_that_of_this_version() -> None:
     """Recorders write the file with its comments, or none for types that they do not find."""
-    definition = text.format(described(CALIBRATION_TYPE)[0])
-    assert typestore_of(CALIBRATION_TYPE, definition) is store_with(CALIBRATION_TYPE)
+    for definition in ('', f'# of the file\n\n{described(CALIBRATION_TYPE)[0]}'):
+        assert typestore_of(CALIBRATION_TYPE, definition) is store_with(CALIBRATION_TYPE)
 
 
 FIELDS = [name for name, _ in store_with(OBSERVATIONS_TYPE).fielddefs[OBSERVATIONS_TYPE][1]]
@@ -123,12 +122,8 @@ def test_the_needed_fields_alone_are_observations(tmp_path: Path) -> None:
 
 
 def test_a_type_of_others_is_that_of_ros_whatever_its_bag_says() -> None:
-    for type_name in (
-        'sensor_msgs/msg/Image',
-        'starcal/msg/Other',
-        "starcal/msg/X'); import os; ('",
-    ):
-        assert typestore_of(type_name, 'int8 x\n') is typestore()
+    for name in ('sensor_msgs/msg/Image', 'starcal/msg/Other', "starcal/msg/X'); import os; ('"):
+        assert typestore_of(name, 'int8 x\n') is typestore()
 
 
 @pytest.mark.parametrize('release', [Stores.ROS2_JAZZY, Stores.ROS2_KILTED])

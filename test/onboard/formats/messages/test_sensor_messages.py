@@ -82,12 +82,9 @@ def test_image_layouts(encoding: str) -> None:
 
 
 def test_native_images_are_not_copied() -> None:
-    """Pixels that are laid out right already are only looked at."""
     data = np.zeros(1024 * 1296 * 2, np.uint8)
-    big = sys.byteorder == 'big'
-    image = decode_image(raw('mono16', 1296, 1024, 2592, big, data), 0)
-    assert np.shares_memory(image.pixels, data)
-    assert not image.pixels.flags.writeable
+    image = decode_image(raw('mono16', 1296, 1024, 2592, sys.byteorder == 'big', data), 0)
+    assert np.shares_memory(image.pixels, data) and not image.pixels.flags.writeable
 
 
 @pytest.mark.parametrize(
@@ -109,19 +106,12 @@ def test_native_images_are_not_copied() -> None:
 )
 def test_image_refusals(change: dict[str, Any], reason: str, detail: str) -> None:
     """An image that does not fit its own description is refused by name, with what was found."""
-    fields: dict[str, Any] = {
-        'encoding': 'mono16',
-        'width': 4,
-        'height': 3,
-        'step': 8,
-        'is_bigendian': False,
-        'data': bytes(24),
-    }
+    image = raw('mono16', 4, 3, 8, False, bytes(24))
+    vars(image).update(change)
     with pytest.raises(ImageRefused) as refused:
-        decode_image(SimpleNamespace(**{**fields, **change}), TIME_NS)
+        decode_image(image, TIME_NS)
     assert refused.value.reason == reason
-    assert detail in refused.value.detail
-    assert len(refused.value.detail) < 200
+    assert detail in refused.value.detail and len(refused.value.detail) < 200
 
 
 @pytest.mark.parametrize('channel', CHANNELS)
@@ -259,9 +249,8 @@ def test_a_serialised_image_is_viewed_as_rosbags_reads_it(type_name, little, fra
     whole = bytes(typestore().serialize_cdr(sent, type_name, little_endian=little))
     expected: Any = typestore().deserialize_cdr(whole, type_name)
     message = view_image(RawMessage('/image', type_name, 5, memoryview(whole)))
-    assert vars(message.header.stamp) == {
-        name: getattr(expected.header.stamp, name) for name in ('sec', 'nanosec')
-    }
+    stamp = expected.header.stamp
+    assert vars(message.header.stamp) == {'sec': stamp.sec, 'nanosec': stamp.nanosec}
     assert message.header.frame_id == frame_id
     assert message.data.obj is whole and message.data == expected.data.tobytes()
     for name in ('height', 'width', 'encoding', 'is_bigendian', 'step'):
@@ -292,13 +281,12 @@ def test_stamps_are_exact(time_ns: int) -> None:
     assert stamp_ns(header.stamp) == time_ns
 
 
-@pytest.mark.parametrize('axis', range(3))
 @pytest.mark.parametrize('speed_m_s', [np.nan, np.inf, -np.inf, -3.1e5])
-def test_a_velocity_of_no_spacecraft_is_refused(axis: int, speed_m_s: float) -> None:
-    velocity = np.zeros(3)
-    velocity[axis] = speed_m_s
-    with pytest.raises(ValueError, match='is faster than any spacecraft: left out'):
-        velocity_from_message(velocity_to_message(6, velocity, 'icrf', plain))
+def test_a_velocity_of_no_spacecraft_is_refused(speed_m_s: float) -> None:
+    for axis in range(3):
+        velocity = np.where(np.arange(3) == axis, speed_m_s, 0.0)
+        with pytest.raises(ValueError, match='is faster than any spacecraft: left out'):
+            velocity_from_message(velocity_to_message(6, velocity, 'icrf', plain))
 
 
 def test_temperature_round_trip() -> None:

@@ -85,30 +85,21 @@ def test_hand_written_ros_yaml(tmp_path: Path) -> None:
     assert read_camera_info(path).parameters.tolist() == expected
 
 
+OF_FIVE = [1, 2, 4, 5, 3]  # k1, k2, p1, p2, k3
+
+
 @pytest.mark.parametrize(
     ('ros_model', 'D', 'model', 'expected'),
     [
-        ('plumb_bob', [1, 2, 4, 5, 3], 'plumb_bob', [1, 2, 3, 4, 5]),
+        ('plumb_bob', OF_FIVE, 'plumb_bob', [1, 2, 3, 4, 5]),
         ('equidistant', [1, 2, 3, 4], 'equidistant', [1, 2, 3, 4]),
         ('fisheye', [1, 2, 3, 4], 'equidistant', [1, 2, 3, 4]),
-        (
-            'rational_polynomial', [1, 2, 4, 5, 3, 6, 7, 8],
-            'rational_polynomial', [1, 2, 3, 4, 5, 6, 7, 8],
-        ),
-        (
-            'rational_polynomial', [1, 2, 4, 5, 3, 6, 7, 8, 9, 10, 11, 12],
-            'thin_prism', [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12],
-        ),
-        (
-            'thin_prism_fraunhofer', [1, 2, 4, 5, 3, 6, 7, 8, 9, 10, 11, 12],
-            'thin_prism', [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12],
-        ),
-        (
-            'rational_polynomial', [1, 2, 4, 5, 3, 6, 7, 8, 9, 10, 11, 12, 13, 14],
-            'tilted', [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14],
-        ),
+        ('rational_polynomial', [*OF_FIVE, *range(6, 9)], 'rational_polynomial', range(1, 9)),
+        ('rational_polynomial', [*OF_FIVE, *range(6, 13)], 'thin_prism', range(1, 13)),
+        ('thin_prism_fraunhofer', [*OF_FIVE, *range(6, 13)], 'thin_prism', range(1, 13)),
+        ('rational_polynomial', [*OF_FIVE, *range(6, 15)], 'tilted', range(1, 15)),
     ],
-)  # fmt: skip
+)
 def test_every_distortion_model_of_ros(tmp_path, ros_model, D, model, expected) -> None:
     D, expected = [0.001 * c for c in D], [0.001 * c for c in expected]
     path = tmp_path / 'camera.yaml'
@@ -162,9 +153,6 @@ def test_file_urls_with_and_without_percent_encoding(tmp_path: Path) -> None:
     for name, url_name in (('a b.yaml', 'a%20b.yaml'), ('100%25.yaml', '100%25.yaml')):
         (tmp_path / name).write_text(ROS_YAML)
         assert resolve_url(f'file://{tmp_path}/{url_name}') == tmp_path / name
-
-
-def test_a_missing_camera_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ProductError, match='none.*cannot be read: No such file'):
         read_camera_info(tmp_path / 'none')
 

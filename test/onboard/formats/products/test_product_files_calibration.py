@@ -24,9 +24,7 @@ from starcal_ros.records import GateCheck, TemperatureTerms
 GATE = (
     GateCheck('residual', 'max_residual_rms_px', 0.1 + 0.2, 1.0, 'px', True),
     GateCheck('solver converged', '', math.nan, math.nan, '', False, 'no_descent'),
-    GateCheck(
-        'turn', 'max_step_rotation_deg', math.nan, 0.5, 'deg', None, 'no calibration was active'
-    ),
+    GateCheck('turn', 'max_step_rotation_deg', math.nan, 0.5, 'deg', None, 'none active'),
 )
 
 
@@ -64,8 +62,7 @@ def test_json_has_the_keys_of_the_interface_document(tmp_path: Path) -> None:
     assert content['schema'] == 1
     assert list(content['intrinsics']) == ['fx', 'skew', 'fy', 'cx', 'cy']
     assert list(content['distortion']) == ['k1', 'k2', 'k3', 'p1', 'p2']
-    assert content['alignment']['parent'] == 'st'
-    assert content['alignment']['child'] == 'cam'
+    assert (content['alignment']['parent'], content['alignment']['child']) == ('st', 'cam')
     assert len(content['alignment']['quaternion_xyzw']) == 4
     assert tuple(content['parameter_names']) == record.parameter_names
     assert content['alignment_covariance_rad2'] == record.covariance[10:, 10:].tolist()
@@ -120,27 +117,18 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
     ('change', 'says'),
     [
         (lambda c: c.update(schema=2), 'schema 2 is not 1'),
-        (lambda c: c['intrinsics'].pop('fy'), "key 'intrinsics.fy' is missing"),
         (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
-        (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
-        (lambda c: c['covariance'].pop(), 'covariance: 12 x 13 numbers, not 12 x 12'),
-        (lambda c: c['covariance'][0].pop(), 'covariance: rows of different length'),
         (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
         (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
         (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
-        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
         # Before the field over the detector takes gigabytes.
         (lambda c: c['image'].update(height=2_000_000), 'image size: .* is over 65536 px'),
-        (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
-        (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
-        (lambda c: c.update(intrinsics=3), 'intrinsics: 3 is not an object'),
         (
             lambda c: c['temperature'].update(alignment_rate_rad_per_degc=[1.0]),
             'temperature.alignment_rate_rad_per_degc_sigma: 3 numbers, not 1',
         ),
         (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix: 1 x 2 numbers, not'),
         (lambda c: c['field'].update(octaves=2), 'field.coefficients: 6 for an axis, not 22'),
-        (lambda c: c.pop('model'), "key 'model' is missing"),
         (lambda c: c['field']['remainder'].pop(), 'field.remainder: 77 numbers, not 78'),
         (
             lambda c: c['field']['remainder'].__setitem__(0, 40000),
@@ -161,8 +149,7 @@ def test_a_damaged_calibration_is_refused_by_file_and_key(tmp_path, change, says
     path.write_text(json.dumps(content))
     with pytest.raises(ProductError, match=says) as caught:
         read_calibration(path)
-    assert str(path) in str(caught.value)
-    assert '\n' not in str(caught.value)
+    assert str(path) in str(caught.value) and '\n' not in str(caught.value)
 
 
 def test_files_that_are_none_are_named(tmp_path: Path) -> None:
