@@ -134,7 +134,6 @@ def test_agrees_with_the_whole_chain_of_erfa(time_s):
     """ICRS to CIRS by ``atci13``, rotated to the GCRS by its precession and nutation."""
     stars = random_stars(500)
     jd1, jd2 = tt_julian_date(time_s * NANOSECONDS_PER_SECOND)
-    years = 16.0  # atci13 counts from J2000
     there = erfa.pmsafe(
         stars.ra_rad,
         stars.dec_rad,
@@ -142,12 +141,9 @@ def test_agrees_with_the_whole_chain_of_erfa(time_s):
         stars.pm_dec_rad_per_year,
         stars.parallax_rad / ARCSECOND_RAD,
         0.0,
-        erfa.DJ00,
-        years * erfa.DJY,
-        erfa.DJ00,
-        0.0,
+        *(erfa.DJ00, 16.0 * erfa.DJY, erfa.DJ00, 0.0),  # atci13 counts from J2000
     )
-    ra_cirs, dec_cirs, _ = erfa.atci13(*there[:4], there[4], there[5], jd1, jd2)
+    ra_cirs, dec_cirs, _ = erfa.atci13(*there, jd1, jd2)
     astrom, _ = erfa.apci13(jd1, jd2)
     expected = erfa.s2c(ra_cirs, dec_cirs) @ astrom['bpn']  # rows: the transpose turns back
     ours = apparent_directions(stars, time_s * NANOSECONDS_PER_SECOND)

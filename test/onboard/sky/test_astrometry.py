@@ -138,9 +138,8 @@ def test_the_air_above_a_site_is_that_which_its_stars_are_seen_through():
     assert np.median(bent) / ARCSECOND_RAD == pytest.approx(size_arcsec, rel=0.01)
     assert sigma_arcsec == pytest.approx(0.057 * size_arcsec)
     # Ten degrees beside those assumed are within the 1-sigma.
-    cold = dataclasses.replace(site, air_temperature_degc=0.0)
-    warm = dataclasses.replace(site, air_temperature_degc=20.0)
-    for other in (cold, warm):
+    for degc in (0.0, 20.0):
+        other = dataclasses.replace(site, air_temperature_degc=degc)
         assert abs(air_above(TIME_NS, other)[1][0] - size_arcsec) < sigma_arcsec
     nowhere, none = air_above(TIME_NS, SiteOptions())
     assert np.isnan(nowhere).all() and not none.any()
@@ -154,13 +153,9 @@ def test_air_pressure_follows_from_height():
         assert standard_pressure_hpa(height_m, degc) == pytest.approx(hpa, rel=0.015)
     high = SiteOptions('ground', 51.5, 0.0, 1500.0, air_temperature_degc=5.25)
     said = dataclasses.replace(high, air_pressure_hpa=standard_pressure_hpa(1500.0, 5.25))
-    directions = np.eye(3)
-    for ours, same in zip(
-        through_the_air(directions, TIME_NS, high),
-        through_the_air(directions, TIME_NS, said),
-        strict=True,
-    ):
-        np.testing.assert_array_equal(ours, same)
+    ours, same = (through_the_air(np.eye(3), TIME_NS, site) for site in (high, said))
+    np.testing.assert_array_equal(ours[0], same[0])
+    np.testing.assert_array_equal(ours[1], same[1])
 
 
 def test_under_the_horizon_all_stays_finite():

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
+from typing import Any
 
 import numpy as np
 import pytest
@@ -114,18 +115,12 @@ def test_a_valid_sample_takes_the_place_of_an_invalid_one_of_its_stamp() -> None
     held = AttitudeHistory()
     held.add(START_NS, None)
     assert refusal(held, START_NS) == 'bad_attitude'
-    held.add(START_NS, attitude_sample(START_NS, q0, DIRECT))
-    # Made unit once more: two roundings.
-    np.testing.assert_allclose(held.at(START_NS, 2.0)[0], q0, rtol=4e-16)
-    held.add(START_NS, None)
-    np.testing.assert_allclose(held.at(START_NS, 2.0)[0], q0, rtol=4e-16)
-
-
-def test_a_sample_at_the_image_needs_no_other() -> None:
-    q0 = random_quaternions(7, 1)[0]
-    found, gap_s = history([(START_NS, q0)]).at(START_NS, 0.0)
-    np.testing.assert_allclose(found, q0, rtol=4e-16)
-    assert gap_s == 0.0
+    for sample in (attitude_sample(START_NS, q0, DIRECT), None):
+        held.add(START_NS, sample)
+        found, gap_s = held.at(START_NS, 0.0)  # the sample at the image needs no other
+        # Made unit once more: two roundings.
+        np.testing.assert_allclose(found, q0, rtol=4e-16)
+        assert gap_s == 0.0
 
 
 @pytest.mark.parametrize(
@@ -167,12 +162,9 @@ def test_the_last_seconds_are_kept_and_at_most_as_many_before_them() -> None:
     assert refusal(held, START_NS + 14 * S - 1) == 'no_attitude'
 
 
-def steady(
-    rate_hz: float, seconds: float, start_ns: int = START_NS
-) -> list[tuple[int, np.ndarray]]:
-    """Samples of a slow rotation about z, 1 mrad/s."""
-    count = int(rate_hz * seconds) + 1
-    stamps = [start_ns + round(k / rate_hz * S) for k in range(count)]
+def steady(rate_hz: float, start_ns: int = START_NS) -> list[tuple[int, np.ndarray]]:
+    """A minute of samples of a slow rotation about z, 1 mrad/s."""
+    stamps = [start_ns + round(k / rate_hz * S) for k in range(int(rate_hz * 60.0) + 1)]
     return [(stamp, turned(stamp)) for stamp in stamps]
 
 
@@ -185,7 +177,7 @@ def turned(time_ns: int) -> np.ndarray:
 def test_any_rate_late_doubled_and_out_of_order(rate_hz: float) -> None:
     """The attitude of a steady rotation does not depend on rate or order of its samples."""
     rng = np.random.default_rng(13)
-    samples = steady(rate_hz, 60.0)
+    samples = steady(rate_hz)
     late_s = rng.uniform(0.0, 8.0, len(samples))  # some overtake hundreds of others
     order = np.argsort([t for t, _ in samples] + late_s * S)
     came = [samples[k] for k in order]
@@ -199,12 +191,17 @@ def test_any_rate_late_doubled_and_out_of_order(rate_hz: float) -> None:
 @pytest.mark.parametrize('wrong_s', [-(10**9), -4000, -60, 60, 4000, 10**9, 9 * 10**8])
 def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
     """A sample stamped in the future does not make the others too old to keep."""
-    samples = steady(10.0, 60.0)
-    k = 300
-    wrong = (samples[k][0] + wrong_s * S, random_quaternions(14, 1)[0])
-    held = history([*samples[:k], wrong, *samples[k + 1 :]], keep_s=3600.0, jump_s=10.0)
+    samples = steady(10.0)
+    wrong = (samples[300][0] + wrong_s * S, random_quaternions(14, 1)[0])
+    held = history([*samples[:300], wrong, *samples[301:]], keep_s=3600.0, jump_s=10.0)
+    assert_steady(held, samples, (1, 29, 31, 59))
+
+
+def assert_steady(
+    held: AttitudeHistory, samples: list[tuple[int, np.ndarray]], at_s: tuple[int, ...]
+) -> None:
     assert held.latest_ns == samples[-1][0]
-    for dt_s in (1, 29, 31, 59):
+    for dt_s in at_s:
         time_ns = START_NS + dt_s * S + S // 3
         found, gap_s = held.at(time_ns, 2.0)
         assert gap_s == pytest.approx(0.1)
@@ -215,13 +212,9 @@ def test_one_wrong_stamp_costs_nothing(wrong_s: int) -> None:
 def test_a_clock_set_back_is_believed(back_s: int) -> None:
     """Samples of the previous and the present clock do not mix; the present ones come first."""
     other = random_quaternions(15, 1)[0]
-    before = [(t, other) for t, _ in steady(10.0, 60.0, START_NS + (back_s - 30) * S)]
-    now = steady(10.0, 60.0)
-    held = history([*before, *now], keep_s=3600.0, jump_s=10.0)
-    assert held.latest_ns == now[-1][0]
-    for dt_s in (1, 31, 59):
-        time_ns = START_NS + dt_s * S + S // 3
-        assert angle_between(held.at(time_ns, 2.0)[0], turned(time_ns)) < 1e-14
+    before = [(t, other) for t, _ in steady(10.0, START_NS + (back_s - 30) * S)]
+    now = steady(10.0)
+    assert_steady(history([*before, *now], keep_s=3600.0, jump_s=10.0), now, (1, 31, 59))
 
 
 def test_memory_of_a_fast_tracker_is_bounded() -> None:
@@ -241,15 +234,16 @@ def test_memory_of_a_fast_tracker_is_bounded() -> None:
 SIGMA_RAD = np.full(3, 10.0 * ARCSECOND_RAD)
 
 
+def sampled(at_s: Any, attitudes: Rotation) -> AttitudeHistory:
+    """Samples at times, s."""
+    stamps_ns = (START_NS + round(t * S) for t in at_s)
+    return history(list(zip(stamps_ns, attitudes.as_quat(), strict=True)))
+
+
 def turning(rate_rad_s: np.ndarray, at_s: tuple[float, ...]) -> AttitudeHistory:
     """Samples of a star tracker that turns at a constant rate about axes of its own."""
     start = Rotation.from_quat(random_quaternions(3, 1)[0])
-    return history(
-        [
-            (START_NS + round(t * S), (start * Rotation.from_rotvec(t * rate_rad_s)).as_quat())
-            for t in at_s
-        ]
-    )
+    return sampled(at_s, start * Rotation.from_rotvec(np.outer(at_s, rate_rad_s)))
 
 
 def test_the_rate_is_that_about_the_own_axes() -> None:
@@ -295,9 +289,7 @@ def test_the_sigma_of_a_rate_is_its_scatter(at_s, memory_s, low, high) -> None:
     in_sigma = []
     for _ in range(200):
         errors = Rotation.from_rotvec(root @ rng.normal(size=(len(at_s), 3)))
-        stamps_ns = (START_NS + round(t * S) for t in at_s)
-        held = history(list(zip(stamps_ns, (true * errors).as_quat(), strict=True)))
-        rate, sigma = held.rate_at(START_NS, 2.0, SIGMA_RAD)
+        rate, sigma = sampled(at_s, true * errors).rate_at(START_NS, 2.0, SIGMA_RAD)
         in_sigma.append((rate - rate_rad_s) / sigma)
     assert low < np.sqrt(np.mean(np.square(in_sigma))) < high
 
@@ -306,8 +298,7 @@ def test_a_camera_that_speeds_up_has_the_rate_of_the_image() -> None:
     """Samples up to 0.2 s after the image: their mean rate is that of 0.4 s before."""
     at_s = np.arange(-0.95, 0.2, 0.1)
     angle = 0.01 * at_s + 0.5 * 0.02 * at_s**2
-    turned = Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])).as_quat()
-    held = history([(START_NS + round(t * S), q) for t, q in zip(at_s, turned, strict=True)])
+    held = sampled(at_s, Rotation.from_rotvec(np.outer(angle, [0.0, 1.0, 0.0])))
     rate, _ = held.rate_at(START_NS, 2.0, SIGMA_RAD)
     np.testing.assert_allclose(rate, [0.0, 0.01, 0.0], atol=1e-5)
 

@@ -118,9 +118,14 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
     [
         (lambda c: c.update(schema=2), 'schema 2 is not 1'),
         (lambda c: c['intrinsics'].update(fx=-1.0), 'not positive'),
+        (lambda c: c['distortion'].update(k1=None), 'distortion.k1: None is not a number'),
+        (lambda c: c['covariance'].pop(), 'covariance: 12 x 13 numbers, not 12 x 12'),
         (lambda c: c.update(covariance=[[1.0]]), 'covariance: 1 x 1 numbers, not 13 x 13'),
         (lambda c: c['parameter_names'].pop(), 'parameters: .* is not 10 finite numbers'),
         (lambda c: c['parameter_names'].__setitem__(9, 'p3'), "key 'distortion.p3' is missing"),
+        (lambda c: c['image'].update(width=-1), 'image.width: -1 is not within 0 to 4294967295'),
+        (lambda c: c['images_refused'].update(blank='x'), "images_refused.blank: 'x' is not a wh"),
+        (lambda c: c['alignment'].update(parent=3), 'alignment.parent: 3 is not a text'),
         # Before the field over the detector takes gigabytes.
         (lambda c: c['image'].update(height=2_000_000), 'image size: .* is over 65536 px'),
         (
@@ -129,6 +134,7 @@ def test_file_and_message_of_a_calibration_are_small(tiny_products: Path) -> Non
         ),
         (lambda c: c['correlation']['matrix'].pop(), 'correlation.matrix: 1 x 2 numbers, not'),
         (lambda c: c['field'].update(octaves=2), 'field.coefficients: 6 for an axis, not 22'),
+        (lambda c: c.pop('model'), "key 'model' is missing"),
         (lambda c: c['field']['remainder'].pop(), 'field.remainder: 77 numbers, not 78'),
         (
             lambda c: c['field']['remainder'].__setitem__(0, 40000),
