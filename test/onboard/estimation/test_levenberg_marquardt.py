@@ -84,14 +84,15 @@ def decays(
     y = own[:, :1] * np.exp(-0.6 * t) + own[:, 1:] * np.exp(-2.5 * t)
     y += 0.05 * rng.normal(size=y.shape)
 
+    def unknowns(x: np.ndarray) -> tuple[np.ndarray, ...]:
+        return *(x[:2] * unit[:2]), *(x[2:].reshape(12, 2) * unit[2:]).T[:, :, None]
+
     def residuals(x: np.ndarray) -> np.ndarray:
-        a, b = x[:2] * unit[:2]
-        c, d = (x[2:].reshape(12, 2) * unit[2:]).T[:, :, None]
+        a, b, c, d = unknowns(x)
         return np.asarray((c * np.exp(-a * t) + d * np.exp(-b * t) - y) * 20.0)
 
     def evaluate(x: np.ndarray) -> NormalEquations:
-        a, b = x[:2] * unit[:2]
-        c, d = (x[2:].reshape(12, 2) * unit[2:]).T[:, :, None]
+        a, b, c, d = unknowns(x)
         slow, fast = np.exp(-a * t), np.exp(-b * t)
         J_shared = np.stack([-c * t * slow * unit[0], -d * t * fast * unit[1]], axis=-1)
         J_blocks = np.stack([slow * unit[2], fast * unit[3]], axis=-1)
@@ -172,16 +173,13 @@ def test_a_start_without_a_cost_is_refused(bad: float) -> None:
 
 def falling_line(x: np.ndarray) -> NormalEquations:
     """Cost 1e4 - x without a minimum, with the right gradient and some curvature."""
-    return NormalEquations(
-        1e4 - float(x[0]), np.eye(1), np.ones(1), np.empty((0, 1, 1)), np.empty((0, 1, 1)),
-        np.empty((0, 1)),
-    )  # fmt: skip
+    return dataclasses.replace(plain(np.eye(1), -np.ones(1)), cost=1e4 - float(x[0]))
 
 
 def test_a_search_without_end_or_against_a_wall_says_so() -> None:
     solution = levenberg_marquardt(np.zeros(1), falling_line, add)
-    assert not solution.converged
-    assert solution.termination == 'iteration_limit' and solution.iterations == MOST_ROUNDS
+    assert not solution.converged and solution.iterations == MOST_ROUNDS
+    assert solution.termination == 'iteration_limit'
 
     # Downhill leads out of the domain: no step is ever allowed, however short.
     def walled(x: np.ndarray) -> NormalEquations:
@@ -189,8 +187,7 @@ def test_a_search_without_end_or_against_a_wall_says_so() -> None:
         return normal if x[0] <= 0 else dataclasses.replace(normal, cost=np.inf)
 
     solution = levenberg_marquardt(np.zeros(1), walled, add)
-    assert solution.state[0] == 0.0
-    assert solution.termination == 'no_descent'
+    assert solution.state[0] == 0.0 and solution.termination == 'no_descent'
 
 
 def test_a_step_to_no_cost_is_taken_back() -> None:

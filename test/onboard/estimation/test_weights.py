@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from four_images import CAMERA, IMAGES, usual  # type: ignore[import-not-found]
 import numpy as np
 from numpy.random import Generator
@@ -41,11 +43,11 @@ def residuals(rng: Generator, covariance_px2: Floats) -> Floats:
     return np.asarray(noise * np.sqrt(covariance_px2[:, [0, 2]]))
 
 
-def estimated(residual: Floats, covariance: Floats, magnitude: Floats) -> CentroidVariance:
-    n = len(residual)
-    return estimate_variance(
-        residual, covariance, magnitude, np.ones(n, bool), np.full(n, 2.0), 4.5
-    )
+def estimated(
+    residual: Floats, covariance: Floats, magnitude: Any, used: Any = True, freedom: Any = 2.0
+) -> CentroidVariance:
+    of_stars = (np.broadcast_to(one, len(residual)) for one in (magnitude, used, freedom))
+    return estimate_variance(residual, covariance, *of_stars, 4.5)
 
 
 @pytest.mark.parametrize(
@@ -88,7 +90,7 @@ def test_a_planted_function_of_brightness_is_recovered() -> None:
 def test_few_stars_show_little_of_a_function_of_brightness() -> None:
     rng = np.random.default_rng(4)
     covariance, magnitude = centroids(rng, 80)
-    alike = estimated(residuals(rng, covariance), covariance, np.full(80, 5.0))
+    alike = estimated(residuals(rng, covariance), covariance, 5.0)
     assert alike.class_magnitude == () == alike.class_factor
     assert alike.factor(np.array([1.0, 9.0])).tolist() == [1.0, 1.0]
     # The prior of a factor of e^0.5 holds what few stars do not show.
@@ -109,7 +111,7 @@ def test_only_stars_that_are_used_count_and_outliers_do_not() -> None:
     assert estimated(wrong, covariance, magnitude).scale == pytest.approx(plain.scale, rel=0.05)
     used = np.arange(N) % 3 > 0
     residual[~used] *= 3.0  # within the clip
-    found = estimate_variance(residual, covariance, magnitude, used, np.full(N, 2.0), 4.5)
+    found = estimated(residual, covariance, magnitude, used)
     assert found.scale == pytest.approx(1.0, abs=0.1)
     assert estimated(residual, covariance, magnitude).scale > 1.3
 
@@ -118,11 +120,11 @@ def test_the_clip_is_at_four_and_a_half_sigma_and_makes_no_step() -> None:
     n = 1000
     covariance = np.tile([1.0, 0.0, 1.0], (n, 1))
     residual = np.random.default_rng(6).normal(size=(n, 2))
-    without = estimated(residual[3:], covariance[3:], np.full(n - 3, 5.0))
+    without = estimated(residual[3:], covariance[3:], 5.0)
     scales = []
     for length in np.linspace(4.0, 5.6, 33):
         residual[:3] = [length, 0.0]
-        scales.append(estimated(residual, covariance, np.full(n, 5.0)).scale / without.scale)
+        scales.append(estimated(residual, covariance, 5.0).scale / without.scale)
     # With an edge the three stars were worth 3 % at once, and an estimate went to and fro.
     assert np.abs(np.diff(scales)).max() < 0.006
     assert np.argmax(scales) in (1, 2, 3, 4) and max(scales) > 1.02
@@ -133,25 +135,20 @@ def test_a_star_without_freedom_does_not_count_without_limit() -> None:
     rng = np.random.default_rng(8)
     covariance, magnitude = centroids(rng, 400)
     residual = residuals(rng, covariance)
-    freedom = np.full(400, 2.0)
-    freedom[:20] = 0.0
     residual[:20] = 0.0
-    found = estimate_variance(residual, covariance, magnitude, np.ones(400, bool), freedom, 4.5)
+    freedom = np.where(np.arange(400) < 20, 0.0, 2.0)
+    found = estimated(residual, covariance, magnitude, freedom=freedom)
     assert found.scale == pytest.approx(1.0, abs=0.25)
 
 
-def test_data_without_noise_reach_the_lower_limit() -> None:
+def test_a_covariance_that_means_nothing_reaches_the_limits_and_a_floor() -> None:
     covariance, magnitude = centroids(np.random.default_rng(9), 500)
     found = estimated(np.full((500, 2), 1e-9), covariance, magnitude)
-    assert found.scale == 0.05
-    assert found.floor_px2 == 0.0
-
-
-def test_a_covariance_that_means_nothing_reaches_the_upper_limit_and_a_floor() -> None:
+    assert (found.scale, found.floor_px2) == (0.05, 0.0)
     rng = np.random.default_rng(10)
     n = 2000
     covariance = np.tile([1e-8, 0.0, 1e-8], (n, 1)) * rng.uniform(0.5, 2.0, (n, 1))
-    found = estimated(rng.normal(size=(n, 2)) * 0.1, covariance, np.full(n, 5.0))
+    found = estimated(rng.normal(size=(n, 2)) * 0.1, covariance, 5.0)
     assert found.scale <= 400.0
     assert found.of(covariance, np.full(n, 5.0))[:, 0].mean() == pytest.approx(0.01, rel=0.1)
 
@@ -183,9 +180,7 @@ def test_scale_and_floor_maximise_the_restricted_likelihood(bright_px: float) ->
     for _ in range(40):
         residual, freedom = fitted(variance)
         assert ((residual**2).sum(axis=1) < 4.0**2 * variance).all()  # inside the clip
-        found = estimate_variance(
-            residual, covariance, np.full(len(own), 5.0), np.ones(len(own), bool), freedom, 4.5
-        )
+        found = estimated(residual, covariance, 5.0, freedom=freedom)
         variance = found.scale * own + found.floor_px2
     # Rounds stop at a step of a twentieth of a sigma.
     assert (found.scale, found.floor_px2) == pytest.approx(tuple(best), rel=5e-3)
