@@ -41,15 +41,17 @@ def exposed(
     )
 
 
-def field(seed: int, detector: Detector) -> tuple[np.ndarray, Centroids, np.ndarray, np.ndarray]:
-    """Errors (n, 2), centroids, bound variances (n, 2), snr (n,) of one image of unlike stars."""
-    xy = star_grid(seed)
-    # The same contrast for any width: the area of the PSF.
-    area = (detector.psf_sigma_px / 0.95) ** 2
-    flux = area * unlike_fluxes(seed, len(xy))
-    found = measured(exposed(seed, xy, flux, detector), xy)
-    bound, snr = centroid_bound(xy, flux, detector, SHAPE)
-    return found.xy_px - xy, found, bound[:, [0, 1], [0, 1]], snr
+def used(found: Centroids) -> np.ndarray:
+    return np.asarray(found.refusal == StarRefusal.NONE)
+
+
+def squares(found: Centroids, xy: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Squared errors (k, 2) of some stars over their variances."""
+    return np.asarray((found.xy_px - xy)[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+
+
+def rms(squared: list[np.ndarray]) -> float:
+    return float(np.sqrt(np.concatenate(squared).mean()))
 
 
 @pytest.mark.parametrize(
@@ -61,19 +63,19 @@ def test_the_fit_reaches_the_cramer_rao_bound(psf_sigma_px: float, bits: int) ->
         detector = dataclasses.replace(detector, bits=8, electrons_per_dn=20.0, offset_dn=12.0)
     over_bound, over_sigma, refused = [], [], Counter[int]()
     for seed in range(6):
-        error, found, bound, snr = field(seed, detector)
-        bright = snr > 10
-        good = bright & (found.refusal == StarRefusal.NONE)
-        refused.update(found.refusal[bright & ~good].tolist())
-        over_bound.append(error[good] ** 2 / bound[good])
-        over_sigma.append(error[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+        xy = star_grid(seed)
+        # The same contrast for any width: the area of the PSF.
+        flux = (psf_sigma_px / 0.95) ** 2 * unlike_fluxes(seed, len(xy))
+        found = measured(exposed(seed, xy, flux, detector), xy)
+        bound, snr = centroid_bound(xy, flux, detector, SHAPE)
+        good = (snr > 10) & used(found)
+        refused.update(found.refusal[(snr > 10) & ~good].tolist())
+        over_bound.append((found.xy_px - xy)[good] ** 2 / bound[good][:, [0, 1], [0, 1]])
+        over_sigma.append(squares(found, xy, good))
     stars = sum(map(len, over_bound))
     assert stars > 2000 and refused.total() < 0.005 * stars, refused
     # Two coordinates of 2400 stars: the ratios are known to 1 %; three of those below 1.
-    ratio = np.sqrt(np.concatenate(over_bound).mean())
-    assert 0.97 < ratio < 1.05
-    truth = np.sqrt(np.concatenate(over_sigma).mean())
-    assert 0.96 < truth < 1.04
+    assert 0.97 < rms(over_bound) < 1.05 and 0.96 < rms(over_sigma) < 1.04
 
 
 @pytest.mark.parametrize(
@@ -123,7 +125,7 @@ def test_no_bias_with_the_phase_in_the_pixel(psf_sigma_px: float) -> None:
     for seed in range(4):
         xy = star_grid(10 + seed)
         found = measured(exposed(seed, xy, np.full(len(xy), 4e5), detector), xy)
-        good = found.refusal == StarRefusal.NONE
+        good = used(found)
         assert good.mean() > 0.99
         error.append((found.xy_px - xy)[good])
         place.append(xy[good])
@@ -143,11 +145,11 @@ def test_a_hot_pixel_takes_no_part_in_a_fit(known: bool) -> None:
         pixels[v, u] += 400
         hot = np.sort(v * pixels.shape[1] + u) if known else np.empty(0, np.int64)
         found = measure_stars(pixels, xy, model, PSF, hot)
-        good = (found.refusal == StarRefusal.NONE) & (found.snr > 10)
+        good = used(found) & (found.snr > 10)
         assert good.mean() > 0.75
-        squared.append((found.xy_px - xy)[good] ** 2 / found.covariance_px2[good][:, [0, 2]])
+        squared.append(squares(found, xy, good))
     # Two coordinates of more than 1200 stars: known to 1.4 %.
-    assert np.sqrt(np.concatenate(squared).mean()) == pytest.approx(1.0, abs=0.05)
+    assert rms(squared) == pytest.approx(1.0, abs=0.05)
 
 
 def test_moments_are_pulled_to_the_middle_of_the_pixel() -> None:
@@ -156,7 +158,7 @@ def test_moments_are_pulled_to_the_middle_of_the_pixel() -> None:
     for flux, bias_px in ((4e5, 0.03), (8e3, 0.08)):
         xy = star_grid(20)
         found = measured(exposed(20, xy, np.full(len(xy), flux), detector), xy, MOMENT)
-        good = found.refusal == StarRefusal.NONE
+        good = used(found)
         assert good.mean() > 0.95
         error = (found.xy_px - xy)[good]
         assert np.abs(bias_with_phase_px(error, xy[good])).max() < bias_px
@@ -246,13 +248,6 @@ def test_noise_alone_gives_no_more_detections_than_it_should(threshold, images) 
     assert count > 0.75 * expected - 3 * np.sqrt(expected)
 
 
-def test_a_given_gain_is_kept() -> None:
-    xy = star_grid(1)
-    pixels = exposed(1, xy, np.full(len(xy), 8000.0), QUIET)
-    model = modelled(pixels, CentroidOptions(gain_e_per_dn=3.3))
-    assert model.pixel_noise.gain_e_per_dn == pytest.approx(3.3)
-
-
 def one_star(
     at: tuple[float, float] = (300.3, 200.6), flux: float = 8000.0, more: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -269,7 +264,7 @@ both_methods = pytest.mark.parametrize('options', [PSF, MOMENT], ids=['psf', 'mo
 
 
 @both_methods
-def test_an_ordinary_star_is_measured(options: CentroidOptions) -> None:
+def test_an_ordinary_star_is_measured_and_a_saturated_one_refused(options) -> None:
     pixels, place = one_star()
     found = measured(pixels, place, options)
     assert found.refusal[0] == StarRefusal.NONE
@@ -279,10 +274,6 @@ def test_an_ordinary_star_is_measured(options: CentroidOptions) -> None:
     # The prediction need not be right to the pixel.
     off = measured(pixels, place + np.array([0.9, -0.8]), options)
     np.testing.assert_allclose(off.xy_px, found.xy_px, rtol=0, atol=0.01)
-
-
-@both_methods
-def test_a_saturated_star_is_refused(options: CentroidOptions) -> None:
     pixels, place = one_star(flux=3e5)
     assert pixels.max() == 4095
     none = dataclasses.replace(options, max_saturated_pixels=0)
@@ -347,34 +338,30 @@ def test_of_a_star_at_the_border_the_fit_takes_what_is_in_the_image(psf_sigma_px
         rng = np.random.default_rng([seed, 7])
         along = np.arange(30.0, height - 30.0, 20.0)
         across = rng.uniform(0.6, 6.0, (4, len(along)))
-        rim = np.concatenate(
-            [
-                np.stack([across[0], along], axis=-1),
-                np.stack([width - 1 - across[1], along], axis=-1),
-                np.stack([along, across[2]], axis=-1),
-                np.stack([along, height - 1 - across[3]], axis=-1),
-            ]
+        sides = (
+            *((across[0], along), (width - 1 - across[1], along)),
+            *((along, across[2]), (along, height - 1 - across[3])),
         )
         corners = np.array([[1.3, 2.2], [width - 2.4, 1.1], [width - 3.2, height - 2.4]])
+        rim = np.concatenate([*(np.stack(side, axis=-1) for side in sides), corners])
         inner = star_grid(seed, 40)
-        xy = np.concatenate([rim, corners, inner[(abs(inner - [320, 256]) < [280, 216]).all(1)]])
+        xy = np.concatenate([rim, inner[(abs(inner - [320, 256]) < [280, 216]).all(1)]])
         flux = np.full(len(xy), 3000.0) * (psf_sigma_px / 0.95) ** 2
         found = measured(exposed(seed, xy, flux, detector), xy)
-        edge = np.arange(len(xy)) < len(rim) + len(corners)
+        edge = np.arange(len(xy)) < len(rim)
         bound, _ = centroid_bound(xy, flux, detector, SHAPE)
-        good = edge & (found.refusal == StarRefusal.NONE)
+        good = edge & used(found)
         assert good.sum() > 0.97 * edge.sum(), Counter(found.refusal[edge].tolist())
-        squared = (found.xy_px - xy)[good] ** 2
-        over_bound.append(squared / bound[good][:, [0, 1], [0, 1]])
-        over_sigma.append(squared / found.covariance_px2[good][:, [0, 2]])
+        over_bound.append((found.xy_px - xy)[good] ** 2 / bound[good][:, [0, 1], [0, 1]])
+        over_sigma.append(squares(found, xy, good))
     # 800 centroids of two coordinates: known to 1.8 %. The bound knows the background, the fit
     # finds it in a stamp that is cut; and a star on the rim is a little fainter in its luck.
-    assert 0.94 < np.sqrt(np.concatenate(over_bound).mean()) < 1.08
-    assert 0.94 < np.sqrt(np.concatenate(over_sigma).mean()) < 1.06
+    assert 0.94 < rms(over_bound) < 1.08 and 0.94 < rms(over_sigma) < 1.06
 
 
 @both_methods
-def test_a_star_whose_core_leaves_the_image_is_refused(options: CentroidOptions) -> None:
+def test_where_no_star_is_none_is_measured(options: CentroidOptions) -> None:
+    """With its core off the image, between the stars of the grid, and none asked for."""
     pixels, _ = one_star()
     height, width = SHAPE
     edge = np.array(
@@ -384,23 +371,10 @@ def test_a_star_whose_core_leaves_the_image_is_refused(options: CentroidOptions)
         ]
     )  # fmt: skip
     assert (measured(pixels, edge, options).refusal == StarRefusal.BORDER).all()
-
-
-@both_methods
-def test_where_no_star_is_none_is_measured(options: CentroidOptions) -> None:
-    pixels, _ = one_star()
-    # Between the stars of the grid.
-    empty = star_grid(7)[5:200] + 12.0
-    found = measured(pixels, empty, options)
-    refused = Counter(found.refusal.tolist())
+    refused = Counter(measured(pixels, star_grid(7)[5:200] + 12.0, options).refusal.tolist())
     # The moments count what stands above their threshold alone: one in 200 is noise.
     assert refused[StarRefusal.NONE] <= (0 if options is PSF else 2), refused
     assert set(refused) <= set(StarRefusal)
-
-
-@both_methods
-def test_no_star_asked_for_none_measured(options: CentroidOptions) -> None:
-    pixels, _ = one_star()
     found = measured(pixels, np.empty((0, 2)), options)
     assert found.xy_px.shape == (0, 2) and found.covariance_px2.shape == (0, 3)
     assert len(found.refusal) == 0
@@ -420,26 +394,27 @@ def test_lit_single_pixels_are_no_sources() -> None:
 COSMIC_RAY = [(k, k // 2 - 1, 700.0) for k in range(-5, 6)]
 
 
-@pytest.mark.parametrize('lit', [[(1, 0, 1500.0)], [(1, 1, 1500.0)], COSMIC_RAY])
-def test_a_star_with_lit_pixels_in_its_core_is_refused(lit: list[tuple[int, int, float]]) -> None:
-    """A hot pixel beside its middle, or a cosmic ray through it."""
+def lit(*pixels: tuple[int, int, float]) -> np.ndarray:
+    """Light in pixels by their distance from that of the star."""
     light = np.zeros(SHAPE)
-    for right, down, electrons in lit:
+    for right, down, electrons in pixels:
         light[201 + down, 300 + right] = electrons
-    pixels, place = one_star(more=light)
-    assert measured(pixels, place).refusal[0] == StarRefusal.ELONGATED
+    return light
+
+
+@pytest.mark.parametrize('light', [lit((1, 0, 1500.0)), lit((1, 1, 1500.0)), lit(*COSMIC_RAY)])
+def test_a_star_with_lit_pixels_in_its_core_is_refused(light: np.ndarray) -> None:
+    """A hot pixel beside its middle, or a cosmic ray through it."""
+    assert measured(*one_star(more=light)).refusal[0] == StarRefusal.ELONGATED
 
 
 @pytest.mark.parametrize(
-    ('away', 'flux', 'lit'),
-    [((2, 0), 3000.0, 2e4), ((-2, 1), 2e5, 3000.0), ((-1, -2), 3000.0, 2e4)],
+    ('flux', 'ray'), [(3000.0, (2, 0, 2e4)), (2e5, (-2, 1, 3000.0)), (3000.0, (-1, -2, 2e4))]
 )
-def test_a_star_beside_a_single_lit_pixel_is_measured(away, flux, lit) -> None:
+def test_a_star_beside_a_single_lit_pixel_is_measured(flux, ray) -> None:
     """Lit far above a faint star, and as bright as the flank of a bright one."""
-    ray = np.zeros(SHAPE)
-    ray[201 + away[1], 300 + away[0]] = lit
     clean = measured(*one_star(flux=flux))
-    found = measured(*one_star(flux=flux, more=ray))
+    found = measured(*one_star(flux=flux, more=lit(ray)))
     assert found.refusal[0] == StarRefusal.NONE
     # Without one pixel of its flank a star is hardly worse, and where it was.
     sigma_px = np.sqrt(found.covariance_px2[0, [0, 2]])
@@ -464,7 +439,7 @@ def test_without_enough_bright_stars_the_width_is_not_known() -> None:
     model = modelled(pixels)
     assert model.psf_sigma_px == 0.0
     found = measure_stars(pixels, xy, model, PSF)
-    assert (found.refusal == StarRefusal.NONE).all() and np.abs(found.xy_px - xy).max() < 0.2
+    assert used(found).all() and np.abs(found.xy_px - xy).max() < 0.2
 
 
 def test_the_noise_of_few_faint_stars_is_no_change_of_their_shape() -> None:
@@ -473,6 +448,9 @@ def test_the_noise_of_few_faint_stars_is_no_change_of_their_shape() -> None:
     model = modelled(exposed(14, xy, unlike_fluxes(14, len(xy)), QUIET))
     faint = exposed(15, xy, np.full(len(xy), 500.0), QUIET)
     groups = np.array_split(xy, len(xy) // 8)
+    # A gain that is given is kept.
+    given = modelled(faint, CentroidOptions(gain_e_per_dn=3.3))
+    assert given.pixel_noise.gain_e_per_dn == pytest.approx(3.3)
     images = [measure_stars(faint, group, model, PSF) for group in groups]
     snr = np.concatenate([image.snr for image in images])
     assert len(images) > 50 and 8.0 < np.median(snr) < 15.0
@@ -562,12 +540,9 @@ def test_a_lens_whose_stars_are_no_gaussians(gain: float) -> None:
     flux_dn = 10 ** rng.uniform(2.3, 3.9, count)
     lobes_px = np.array([[0.0, 0.0], [0.9, 0.5], [-0.3, 1.1]])
     share = np.array([0.75, 0.15, 0.10])
-    light = np.array(
-        [
-            star_electrons(4 + place + lobes_px, flux * share, 0.55, (side, side))
-            for place, flux in zip(place_px, flux_dn, strict=True)
-        ]
-    )
+    places, fluxes = 4 + place_px[:, None] + lobes_px, np.outer(flux_dn, share)
+    stars = zip(places, fluxes, strict=True)
+    light = np.array([star_electrons(*star, 0.55, (side, side)) for star in stars])
     stamps = 20.0 + rng.poisson(light * gain) / gain + rng.normal(0.0, 1.5, light.shape)
     noise_dn, noise = np.full(count, 1.5), PixelNoise(1.0, 0.02)
     for _ in range(5):

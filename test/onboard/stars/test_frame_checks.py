@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 import functools
+from typing import Any
 
 import cv2
 import numpy as np
@@ -71,15 +72,10 @@ def test_frames_of_any_size_are_judged(shape: tuple[int, int]) -> None:
     assert refusal(np.zeros(shape, np.uint8)) == 'blank'
 
 
-def part(value: int, rows: slice = slice(None), columns: slice = slice(None)) -> Pixels:
+def part(source: Any, rows: slice = slice(None), columns: slice = slice(None)) -> Pixels:
+    """A frame with other values in a part."""
     pixels = frame().copy()
-    pixels[rows, columns] = value
-    return pixels
-
-
-def placed(where: slice, source: Pixels) -> Pixels:
-    pixels = frame().copy()
-    pixels[where] = source
+    pixels[rows, columns] = source
     return pixels
 
 
@@ -100,8 +96,8 @@ LOWER, UPPER = slice(HALF, None), slice(None, HALF)
         # A value like the sky's own is no sky either: it has no noise.
         ('incomplete', lambda: part(int(np.median(frame())), rows=LOWER)),
         ('incomplete', lambda: part(0, rows=slice(100, 100 + HEIGHT // 20))),
-        ('incomplete', lambda: placed(LOWER, frame()[HALF - 1])),
-        ('incomplete', lambda: placed(LOWER, frame()[:HALF])),
+        ('incomplete', lambda: part(frame()[HALF - 1], LOWER)),
+        ('incomplete', lambda: part(frame()[:HALF], LOWER)),
     ],
 )
 def test_a_lost_frame_is_refused(reason: str, made: Callable[[], Pixels]) -> None:
@@ -132,9 +128,8 @@ def test_a_frame_without_noise_is_known_again() -> None:
 
 
 def test_a_frame_half_of_the_one_before_is_incomplete() -> None:
-    assert refusal(placed(LOWER, frame(1)[HALF:]), known(frame(1))) == 'incomplete'
-    # Whichever stamp it carries.
-    assert refusal(placed(LOWER, frame(1)[HALF:]), known(frame(1), S)) == 'incomplete'
+    for time_ns in (0, S):  # whichever stamp it carries
+        assert refusal(part(frame(1)[HALF:], LOWER), known(frame(1), time_ns)) == 'incomplete'
 
 
 @pytest.mark.parametrize('noise_dn', [0.3, 1.0, 4.0])
@@ -155,10 +150,11 @@ def test_a_bright_disc_is_no_loss() -> None:
     assert refusal(pixels, saturation_dn=4200.0) == 'incomplete'
 
 
-def ramp(slope: float) -> Pixels:
+def ramp(slope: float, level_dn: float = 200.0, across: Any = None) -> Pixels:
     """Noise of 5 DN on a sky that rises by a slope in that noise per pixel, across."""
-    noise = np.random.default_rng(4).normal(200.0, 5.0, (HEIGHT, WIDTH))
-    return np.rint(noise + 5.0 * slope * np.arange(WIDTH)).astype(np.uint16)
+    noise = np.random.default_rng(4).normal(level_dn, 5.0, (HEIGHT, WIDTH))
+    rise = np.arange(WIDTH) if across is None else across
+    return np.rint(noise + 5.0 * slope * rise).astype(np.uint16)
 
 
 @pytest.mark.parametrize('slope', [0.0, 0.03, 0.5, 3.0])
@@ -171,11 +167,7 @@ def test_a_steady_slope_of_the_sky_is_no_glare(slope: float) -> None:
 
 def bent(slope: float) -> Pixels:
     """As `ramp`, with waves of 256 px whose slope has that amplitude."""
-    u = np.arange(WIDTH)
-    waves = 256.0 / (2 * np.pi) * np.sin(2 * np.pi * u / 256.0)
-    noise = np.random.default_rng(4).normal(900.0, 5.0, (HEIGHT, WIDTH))
-    pixels: np.ndarray = np.rint(noise + 5.0 * slope * waves).astype(np.uint16)
-    return pixels
+    return ramp(slope, 900.0, 256 / (2 * np.pi) * np.sin(2 * np.pi * np.arange(WIDTH) / 256.0))
 
 
 def test_a_bent_sky_is_glare_but_what_the_dark_frame_explains() -> None:

@@ -32,15 +32,12 @@ NOISE_DN = DETECTOR.noise_electrons / DETECTOR.electrons_per_dn
 @functools.cache
 def images(count: int, looking: int | None = None) -> tuple[tuple[Pixels, Rotation], ...]:
     """Frames and where the camera looked: at one field after the other, or at one all the time."""
-    shown = [scenario.scene(SCENARIO, k if looking is None else looking) for k in range(count)]
-    pattern = rendering.fixed_pattern(SCENARIO)
-    return tuple(
-        (
-            rendering.render(SCENARIO, one, k, pattern).pixels,
-            Rotation.from_matrix(one.camera_from_icrf).inv(),
-        )
-        for k, one in enumerate(shown)
-    )
+    pattern, made = rendering.fixed_pattern(SCENARIO), []
+    for k in range(count):
+        one = scenario.scene(SCENARIO, k if looking is None else looking)
+        pixels = rendering.render(SCENARIO, one, k, pattern).pixels
+        made.append((pixels, Rotation.from_matrix(one.camera_from_icrf).inv()))
+    return tuple(made)
 
 
 def learnt(seen: tuple[tuple[Pixels, Rotation], ...], known: HotPixels = UNKNOWN) -> HotPixels:
@@ -51,10 +48,9 @@ def learnt(seen: tuple[tuple[Pixels, Rotation], ...], known: HotPixels = UNKNOWN
 
 def hot_in_truth(sigmas: float) -> set[int]:
     """Hot pixels of the simulated detector so far above its noise, not on its border."""
-    excess = (rendering.fixed_pattern(SCENARIO) - DETECTOR.background_electrons).copy()
-    excess[[0, -1]] = 0.0
-    excess[:, [0, -1]] = 0.0
-    return set(np.flatnonzero(excess > sigmas * DETECTOR.noise_electrons).tolist())
+    excess = rendering.fixed_pattern(SCENARIO) - DETECTOR.background_electrons
+    inner = np.pad(excess[1:-1, 1:-1], 1)
+    return set(np.flatnonzero(inner > sigmas * DETECTOR.noise_electrons).tolist())
 
 
 def test_hot_pixels_are_learnt_from_two_fields() -> None:
@@ -103,8 +99,7 @@ def test_large_detectors_are_scanned_in_turns() -> None:
     pixels[hot[:, 0], hot[:, 1]] = 300
     camera = CameraModel(2592, 2048, np.array([7e3, 0, 7e3, 1295.5, 1023.5, 0, 0, 0, 0, 0]))
     known, found = UNKNOWN, []
-    for k in range(22):
-        looking = Rotation.from_euler('x', k, degrees=True)
+    for looking in Rotation.from_euler('x', np.arange(22), degrees=True):
         known = learn_hot_pixels(known, pixels, 100.0, 2.0, looking, camera)
         found.append(len(known.index))
     assert found == [0] * 11 + [1] * 5 + [2] * 5 + [3]

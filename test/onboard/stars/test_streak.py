@@ -27,16 +27,10 @@ PARTS = (np.arange(2000) + 0.5) / 2000 - 0.5
 def test_light_of_a_streak_is_the_mean_of_its_places(sigma_px, length_px, angle_rad) -> None:
     path_px = length_px * np.array([math.cos(angle_rad), math.sin(angle_rad)])
     middle_px, width = np.array([0.2, -0.3]), 2 * stamp_radius_px(sigma_px, length_px) + 1
-    many = len(PARTS)
-    exact = light_in_stamps(
-        middle_px + PARTS[:, None] * path_px,
-        np.full(many, 1.0 / many),
-        np.full(many, sigma_px),
-        width,
-    ).sum(axis=0)
-    light = light_in_stamps(
-        middle_px[None], np.ones(1), np.array([sigma_px]), width, path_px[None]
-    )
+    one, places_px = np.ones(1), middle_px + PARTS[:, None] * path_px
+    many = np.ones(len(PARTS))
+    exact = light_in_stamps(places_px, many / many.sum(), sigma_px * many, width).sum(axis=0)
+    light = light_in_stamps(middle_px[None], one, sigma_px * one, width, path_px[None])
     # The quadrature has some nodes only, and fits are good to a hundredth of a pixel.
     assert np.abs(light[0] - exact).max() < 1e-4 * exact.max()
 
