@@ -25,7 +25,7 @@ from starcal_ros.identification.star_finder import (
     StarSearch,
 )
 from starcal_ros.identification.tracking import track_stars
-from starcal_ros.records import CameraGeometry, StarRefusal
+from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.centroiding import Centroids
 from starcal_ros.stars.detection import Background
@@ -53,14 +53,9 @@ def with_lost_rows(index: int, row: int, lost: int) -> Exposure:
 
 
 # 1 % of the focal length and 0.08 of k1: 6 px in a corner.
-WRONG = CameraGeometry(
-    PRIOR.camera.replace(
-        fx=1.01 * PRIOR.camera.intrinsics[0],
-        fy=1.01 * PRIOR.camera.intrinsics[2],
-        k1=PRIOR.camera.distortion[0] + 0.08,
-    ),
-    PRIOR.star_tracker_from_camera_xyzw,
-)
+FX, _, FY, *_ = PRIOR.camera.intrinsics
+OFF = PRIOR.camera.replace(fx=1.01 * FX, fy=1.01 * FY, k1=PRIOR.camera.distortion[0] + 0.08)
+WRONG = dataclasses.replace(PRIOR, camera=OFF)
 PRIORS = {'prior': PRIOR, 'wrong prior': WRONG}
 
 
@@ -106,9 +101,8 @@ def test_noise_alone_makes_no_tear(n: int) -> None:
     xy = places(n)
     for _ in range(50):
         sigma = 10 ** rng.uniform(-2, -0.5, n)
-        assert (
-            find_line_loss(xy, xy + sigma[:, None] * rng.normal(size=(n, 2)), sigma, SHAPE) is None
-        )
+        measured = xy + sigma[:, None] * rng.normal(size=(n, 2))
+        assert find_line_loss(xy, measured, sigma, SHAPE) is None
 
 
 def test_wrong_stars_on_one_side_make_no_tear() -> None:
@@ -167,9 +161,13 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
     )  # fmt: skip
 
 
-def judged(magnitude: np.ndarray, place: np.ndarray, centroids: Centroids) -> np.ndarray:
+def judged(
+    magnitude: np.ndarray, place: np.ndarray, centroids: Centroids, **changes: np.ndarray
+) -> np.ndarray:
+    """Refusals of the stars of a sky with some columns changed."""
     most_mag = IdentificationOptions().max_brightness_scatter_mag
-    return refuse_by_brightness(magnitude, place, centroids, MODEL, MIN_SNR, most_mag)
+    changed = dataclasses.replace(centroids, **changes)
+    return refuse_by_brightness(magnitude, place, changed, MODEL, MIN_SNR, most_mag)
 
 
 @pytest.mark.parametrize(('count', 'scatter_mag'), [(4, 0.3), (8, 0.15), (60, 0.3), (600, 0.0)])
@@ -177,26 +175,23 @@ def test_a_true_sky_is_left_alone(count: int, scatter_mag: float) -> None:
     # 5 sigma of what is measured: of four stars the scatter itself is known to a half.
     for seed in range(20):
         assert (judged(*sky(count, scatter_mag, seed)) == StarRefusal.NONE).all()
+    # A camera far from the band of the catalog need not be asked.
+    assert (refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0) == StarRefusal.NONE).all()
 
 
 def test_brightnesses_drawn_anew_are_no_match() -> None:
     for seed in range(100):
-        magnitude, place, centroids = sky(20, 0.2, seed)
-        rng = np.random.default_rng(seed)
-        shuffled = dataclasses.replace(centroids, flux_dn=rng.permutation(centroids.flux_dn))
+        shown = sky(20, 0.2, seed)
+        shuffled_dn = np.random.default_rng(seed).permutation(shown[2].flux_dn)
         with pytest.raises(ImageRefused, match='no_match: .* brightnesses scatter by'):
-            judged(magnitude, place, shuffled)
-
-
-def test_a_camera_far_from_the_band_of_the_catalog_need_not_be_asked() -> None:
-    assert (refuse_by_brightness(*sky(60, 1.5), MODEL, MIN_SNR, 100.0) == StarRefusal.NONE).all()
+            judged(*shown, flux_dn=shuffled_dn)
 
 
 def test_one_star_unlike_the_others_is_ambiguous() -> None:
     magnitude, place, centroids = sky(60, 0.2)
     flux = centroids.flux_dn.copy()
     flux[[3, 40]] *= [10.0, 0.1]
-    refusal = judged(magnitude, place, dataclasses.replace(centroids, flux_dn=flux))
+    refusal = judged(magnitude, place, centroids, flux_dn=flux)
     assert np.flatnonzero(refusal == StarRefusal.AMBIGUOUS).tolist() == [3, 40]
 
 
@@ -207,7 +202,7 @@ def test_a_bright_star_that_is_gone_is_not_called_faint() -> None:
     magnitude[7] = limit
     refusal = centroids.refusal.copy()
     refusal[[*gone, 7]] = StarRefusal.FAINT
-    found = judged(magnitude, place, dataclasses.replace(centroids, refusal=refusal))
+    found = judged(magnitude, place, centroids, refusal=refusal)
     assert (found[gone] == StarRefusal.NOT_DETECTED).all() and found[7] == StarRefusal.FAINT
 
 
@@ -218,14 +213,11 @@ def test_the_few_of_a_part_that_misses_its_stars_are_ambiguous() -> None:
     refusal = np.where(corner, StarRefusal.NOT_DETECTED, centroids.refusal)
     refusal[met] = StarRefusal.NONE
     assert corner.sum() > 20
-    found = judged(magnitude, place, dataclasses.replace(centroids, refusal=refusal))
+    found = judged(magnitude, place, centroids, refusal=refusal)
     assert (found[met] == StarRefusal.AMBIGUOUS).all()
     assert (found[~corner] == StarRefusal.NONE).all()
-
-
-def test_stars_missing_everywhere_are_no_sign_of_a_wrong_match() -> None:
-    magnitude, place, centroids = sky(300, 0.2)
-    rng = np.random.default_rng(3)
-    refusal = np.where(rng.uniform(size=300) < 0.6, StarRefusal.NOT_DETECTED, centroids.refusal)
-    found = judged(magnitude, place, dataclasses.replace(centroids, refusal=refusal))
+    # Stars that miss everywhere are no sign of a wrong match.
+    missing = np.random.default_rng(3).uniform(size=300) < 0.6
+    refusal = np.where(missing, StarRefusal.NOT_DETECTED, centroids.refusal)
+    found = judged(magnitude, place, centroids, refusal=refusal)
     np.testing.assert_array_equal(found, refusal)

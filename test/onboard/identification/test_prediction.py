@@ -80,10 +80,9 @@ def test_a_polynomial_is_found_whatever_its_size() -> None:
     one_px = shift / (np.median(np.hypot(*shift.T)) * RAYLEIGH_TO_SIGMA)
     for size in (0.5, 1.0, 2.0):
         measured_px = predicted_px + size * one_px
-        given = predicted_px, measured_px, np.full(200, 0.1), predicted_px, HALF_PX
-        assert (
-            np.abs(fit_warp(*given)[0] - size * one_px).max() < 1e-3 and fit_warp(*given)[1] < 0.02
-        )
+        sigma_px = np.full(200, 0.1)
+        warp_px, scatter_px = fit_warp(predicted_px, measured_px, sigma_px, predicted_px, HALF_PX)
+        assert np.abs(warp_px - size * one_px).max() < 1e-3 and scatter_px < 0.02
 
 
 @pytest.mark.parametrize(('stars', 'degree'), [(4, 0), (12, 1), (36, 3), (150, 5)])

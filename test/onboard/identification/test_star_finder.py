@@ -33,8 +33,7 @@ SEARCH = StarSearch(CATALOG)
 
 @functools.cache
 def shown(index: int) -> tuple[Scene, Exposure]:
-    one, exposure = exposure_of(SCENARIO, index)
-    return one, exposure
+    return exposure_of(SCENARIO, index)  # type: ignore[no-any-return]
 
 
 def observed(
@@ -66,8 +65,7 @@ def test_every_star_is_the_right_one(index: int) -> None:
     found = observed(exposure)
     assert_right(found, one)
     assert found.psf_sigma_px == pytest.approx(SCENARIO.detector.psf_sigma_px, rel=0.02)
-    assert found.catalog_digest == CATALOG.digest
-    assert found.time_ns == exposure.image.time_ns
+    assert (found.catalog_digest, found.time_ns) == (CATALOG.digest, exposure.image.time_ns)
     magnitude = dict(zip(one.catalog_id.tolist(), one.magnitude, strict=True))
     expected = [magnitude[number] for number in found.catalog_id]
     np.testing.assert_allclose(found.magnitude, expected, rtol=1e-6)
@@ -80,10 +78,8 @@ def test_every_star_is_the_right_one(index: int) -> None:
 )
 def test_an_alignment_that_launch_has_turned_is_acquired(index, tilt_deg, roll_deg) -> None:
     angle = np.random.default_rng(index).uniform(0, 2 * np.pi)
-    axis = np.array([np.cos(angle), np.sin(angle), 0.0])
-    turn = Rotation.from_rotvec(np.radians(tilt_deg) * axis) * Rotation.from_rotvec(
-        [0.0, 0.0, np.radians(roll_deg)]
-    )
+    tilt = Rotation.from_rotvec(np.radians(tilt_deg) * np.r_[np.cos(angle), np.sin(angle), 0.0])
+    turn = tilt * Rotation.from_euler('z', roll_deg, degrees=True)
     one, exposure = shown(index)
     assert_right(observed(exposure, turned(PRIOR, turn)), one)
 
@@ -184,8 +180,7 @@ def test_one_spoilt_star_is_left_out_by_its_reason(reason, centroid, spoil) -> N
 
 
 def noise(sky: np.ndarray, seed: int) -> np.ndarray:
-    random = np.random.default_rng([8, seed]).normal(100, 5, sky.shape)
-    return np.asarray(random, sky.dtype)
+    return np.random.default_rng([8, seed]).normal(100, 5, sky.shape).astype(sky.dtype)
 
 
 @pytest.mark.parametrize(
@@ -205,17 +200,14 @@ def test_an_image_without_the_stars_matches_nothing(made_of, refusals) -> None:
     assert refusal.value.reason in refusals
 
 
-def test_too_few_stars_are_refused() -> None:
+def test_refused_stars_are_told_with_their_places() -> None:
+    one, exposure = shown(0)
     search = StarSearch(CATALOG, CentroidOptions(min_snr=400.0))
-    refused = observed(shown(0)[1], PRIOR, search)
+    refused = observed(exposure, PRIOR, search)
     assert (refused.refusal, len(refused)) == ('too_few_stars', 0)
     assert ' stars measured, ' in refused.detail
     # What became of the others is told all the same.
     assert refused.refused_stars['faint'] > 100 and len(refused.refused_px) > 100
-
-
-def test_refused_stars_are_told_with_their_places() -> None:
-    one, exposure = shown(0)
     found = observed(exposure)
     assert not set(found.refused_catalog_id) & set(found.catalog_id)
     counted = {reason: len(places) for reason, places in found.refused_places().items()}

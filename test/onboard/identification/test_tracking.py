@@ -22,7 +22,7 @@ from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import ImageRefused
 from starcal_ros.identification.star_finder import Exposure, observe_stars, StarSearch
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
-from starcal_ros.records import CameraGeometry, Image, StarObservations
+from starcal_ros.records import Image, StarObservations
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.image_model import CentroidOptions
 
@@ -42,19 +42,16 @@ def exposure(index: int, turn_rad: float = 0.0) -> Exposure:
     """Image with its reported attitude rotated about an axis."""
     one, image = shown(index)
     turn = Rotation.from_rotvec(turn_rad * np.array([0.6, -0.8, 0.0]))
-    return Exposure(
-        image, (Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * turn).as_quat(), 0.5
-    )
+    reported = Rotation.from_quat(one.icrf_from_star_tracker_xyzw) * turn
+    return Exposure(image, reported.as_quat(), 0.5)
 
 
 @functools.cache
 def searched(index: int) -> tuple[StarObservations, TrackedCamera]:
-    observations, known = started(exposure(index), PRIOR, SEARCH)
-    return observations, known
+    return started(exposure(index), PRIOR, SEARCH)  # type: ignore[no-any-return]
 
 
-def followed(image: Exposure, before: TrackedCamera) -> tuple[StarObservations, TrackedCamera]:
-    return track_stars(image, before, SEARCH)
+followed = functools.partial(track_stars, search=SEARCH)
 
 
 @pytest.mark.parametrize('index', [1, 2, 5])
@@ -144,20 +141,15 @@ def test_a_width_that_changes_over_the_field_is_learnt() -> None:
 @pytest.mark.parametrize(('scale', 'k1'), [(1.02, 0.0), (1.0, 0.05)])
 def test_the_camera_that_predicts_is_corrected(scale: float, k1: float) -> None:
     camera = PRIOR.camera
-    wrong = camera.replace(
-        fx=camera.intrinsics[0] * scale,
-        fy=camera.intrinsics[2] * scale,
-        k1=camera.distortion[0] + k1,
-    )
-    geometry = CameraGeometry(wrong, PRIOR.star_tracker_from_camera_xyzw)
-    _, known = started(exposure(0), geometry, SEARCH)
+    fx, _, fy, *_ = scale * camera.intrinsics
+    wrong = camera.replace(fx=fx, fy=fy, k1=camera.distortion[0] + k1)
+    _, known = started(exposure(0), dataclasses.replace(PRIOR, camera=wrong), SEARCH)
     tracked, known = followed(exposure(1), known)
     assert len(tracked) > 0.95 * len(searched(1)[0])
     grid = pixel_grid(camera, 9, 7)
-    turn, _ = Rotation.align_vectors(
-        line_of_sight(known.geometry.camera, grid), line_of_sight(SCENARIO.truth.camera, grid)
-    )
-    off = project(known.geometry.camera, turn.apply(line_of_sight(SCENARIO.truth.camera, grid)))
+    true = line_of_sight(SCENARIO.truth.camera, grid)
+    turn, _ = Rotation.align_vectors(line_of_sight(known.geometry.camera, grid), true)
+    off = project(known.geometry.camera, turn.apply(true))
     # What stars of one image tell of the corners, where it was 7 px off.
     assert np.abs(off - grid).max() < 1.0
 
@@ -226,8 +218,7 @@ def test_an_image_without_psf_starts_no_track() -> None:
 def test_the_saturation_that_images_before_have_shown(plateau: float, refused: int) -> None:
     _, known = searched(0)
     tracked, _ = followed(exposure(1), known)
-    brightest = np.rint(tracked.measured_px[tracked.flux_dn.argmax()]).astype(int)
-    u, v = brightest
+    u, v = np.rint(tracked.measured_px[tracked.flux_dn.argmax()]).astype(int)
     peak = float(shown(1)[1].pixels[v - 1 : v + 2, u - 1 : u + 2].max())
     # One pixel at the level is no plateau of its own; one above it shows that it was none.
     instrument = dataclasses.replace(known.instrument, saturation_dn=0.98 * plateau * peak)
@@ -253,8 +244,7 @@ def exposed(
 ) -> tuple[Scene, Exposure]:
     """Scene and image of a camera that turns during its exposure."""
     moving = dataclasses.replace(SCENARIO, turn_rad=turn_rad, detector=detector)
-    one, image = exposure_of(moving, index)
-    return one, image
+    return exposure_of(moving, index)  # type: ignore[no-any-return]
 
 
 @pytest.mark.parametrize(
@@ -273,7 +263,7 @@ def test_streaks_are_measured_at_their_middle(turn_rad: Turn, tracked: bool) -> 
     before, track = searched(1)
     one, image = exposed(turn_rad)
     if tracked:
-        observations, after = track_stars(image, track, SEARCH)
+        observations, after = followed(image, track)
         # The next image may be sharp again.
         assert after.instrument is track.instrument
     else:
@@ -297,9 +287,8 @@ def test_few_bright_stars_show_the_streaks_of_a_tracked_image() -> None:
 
 def test_a_longer_streak_is_refused_with_its_length() -> None:
     _, image = exposed(turned(14.0, 0.0, 0.0))
-    with pytest.raises(ImageRefused, match=r'streaks of \d+ px, up to 10') as refused:
+    with pytest.raises(ImageRefused, match=r'^smeared: .*streaks of \d+ px, up to 10'):
         observe_stars(image, PRIOR, SEARCH)
-    assert refused.value.reason == 'smeared'
 
 
 @pytest.mark.parametrize('psf_sigma_px', [0.8, 1.4])
@@ -307,12 +296,11 @@ def test_sharp_images_stay_tracked_whatever_their_focus(psf_sigma_px: float) -> 
     _, track = searched(1)
     detector = dataclasses.replace(SCENARIO.detector, psf_sigma_px=psf_sigma_px)
     for index in (2, 3, 4):
-        _, track = track_stars(exposed(SHARP, index, detector)[1], track, SEARCH)
+        _, track = followed(exposed(SHARP, index, detector)[1], track)
 
 
 def test_streaks_of_which_too_few_are_alone_are_searched_again(monkeypatch) -> None:
     _, track = searched(1)
     monkeypatch.setattr('starcal_ros.stars.image_model._ISOLATED_PX', 1000.0)
-    with pytest.raises(ImageRefused, match='too few of them are alone') as refused:
-        track_stars(exposed(turned(6.0, 0.0, 0.0))[1], track, SEARCH)
-    assert refused.value.reason == 'no_match'
+    with pytest.raises(ImageRefused, match='^no_match: .*too few of them are alone'):
+        followed(exposed(turned(6.0, 0.0, 0.0))[1], track)
