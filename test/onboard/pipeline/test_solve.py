@@ -35,7 +35,13 @@ from starcal_ros.options import names_of
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup, with_method
 from starcal_ros.pipeline.solve import provenance_of
-from starcal_ros.records import ALIGNMENT_NAMES, Ensemble, refused_image, StarObservations
+from starcal_ros.records import (
+    ALIGNMENT_NAMES,
+    Calibration,
+    Ensemble,
+    refused_image,
+    StarObservations,
+)
 
 
 @pytest.fixture(scope='module')
@@ -44,13 +50,9 @@ def setup(camera_yaml: Path) -> Setup:
 
 
 def test_refused_images_are_counted(setup: Setup) -> None:
-    collected = Ensemble()
-    for observations in (
-        ensemble().images[0],
-        refused_image(image().time_ns, 640, 512, 'out_of_order', ''),
-        ensemble().images[1],
-        refused_image(image().time_ns, 640, 512, 'out_of_order', ''),
-    ):
+    collected, late = Ensemble(), refused_image(image().time_ns, 640, 512, 'out_of_order', '')
+    first, second, *_ = ensemble().images
+    for observations in (first, late, second, late):
         collected = solve.add_to_ensemble(collected, observations, setup)
     assert collected.images == ensemble().images[:2]
     assert collected.refused == {'out_of_order': 2}
@@ -83,8 +85,13 @@ def test_at_the_limit_an_image_goes_for_each_that_comes(camera_yaml: Path) -> No
         assert min(len(i) for i in kept.images) > stars[2]
 
 
-def test_a_solution_with_its_statistics(setup: Setup) -> None:
-    found = solve.solve(ensemble(), setup)
+@pytest.fixture(scope='module')
+def found(setup: Setup) -> Calibration:
+    """Calibration of the small campaign."""
+    return solve.solve(ensemble(), setup)
+
+
+def test_a_solution_with_its_statistics(found: Calibration) -> None:
     assert found.accepted and found.reasons == ()
     assert found.termination == 'converged'
     assert found.method == CalibrationOptions().method
@@ -93,10 +100,7 @@ def test_a_solution_with_its_statistics(setup: Setup) -> None:
     assert found.stars_used + found.stars_rejected == ensemble().star_count
     assert found.time_ns == ensemble().images[-1].time_ns
     assert found.variance_factor == pytest.approx(1.0, abs=0.1)
-    assert (found.parent_frame, found.child_frame) == (
-        'star_tracker',
-        'camera_optical_frame',
-    )
+    assert (found.parent_frame, found.child_frame) == ('star_tracker', 'camera_optical_frame')
     # Skew of 0.1 px or so, sheared over half the height.
     assert 0 < found.zero_skew_cost_px < 0.2
     error = found.geometry.camera.parameters - TRUTH.camera.parameters
@@ -107,15 +111,15 @@ def test_a_solution_with_its_statistics(setup: Setup) -> None:
     assert turn_between(found.geometry, TRUTH).magnitude() / ARCSECOND_RAD < 50
 
 
-def test_lateral_colour_is_estimated(setup: Setup) -> None:
-    per_mag, mean = 5e-4, 0.65  # 0.2 px a magnitude in a corner; about the mean of the stars
-    images = []
-    for one in ensemble().images:
+def test_lateral_colour_is_estimated(setup: Setup, found: Calibration) -> None:
+    plain, per_mag, mean = found, 5e-4, 0.65  # 0.2 px a magnitude in a corner; mean of the stars
+
+    def moved(_: int, one: StarObservations) -> dict[str, object]:
         colour = np.nan_to_num(setup.catalog.colours_bp_rp(one.catalog_id) - mean)
         from_axis = one.measured_px - TRUTH.camera.parameters[3:5]
-        moved = one.measured_px + per_mag * colour[:, None] * from_axis
-        images.append(dataclasses.replace(one, measured_px=moved))
-    plain, found = (solve.solve(e, setup) for e in (ensemble(), Ensemble(tuple(images))))
+        return {'measured_px': one.measured_px + per_mag * colour[:, None] * from_axis}
+
+    found = solve.solve(each_image(ensemble(), moved), setup)
     assert found.accepted
     (part,) = (part for part in found.sigma_budget if part.cause == 'lateral colour')
     # Thousands of stars of 0.17 px, and a few of 0.001 px, show it to 1e-5.
@@ -177,18 +181,15 @@ def test_images_with_temperatures_give_a_calibration_with_terms(camera_yaml: Pat
     measured = each_image(images, lambda k, _: {'temperature_degc': 10.0 + 5.0 * k})
     terms = solve.solve(measured, warm).temperature
     assert terms is not None and (terms.reference_degc, terms.note) == (20.0, '')
-    for values_found, sigma in (
-        (terms.focal_per_degc, terms.focal_per_degc_sigma),
-        (terms.alignment_rate_rad_per_degc, terms.alignment_rate_rad_per_degc_sigma),
-    ):
-        assert values_found and (np.abs(values_found) < 4 * np.array(sigma)).all()
+    for name in ('focal_per_degc', 'alignment_rate_rad_per_degc'):
+        estimated, sigma = getattr(terms, name), getattr(terms, f'{name}_sigma')
+        assert estimated and (np.abs(estimated) < 4 * np.array(sigma)).all()
     terms = solve.solve(images, warm).temperature
     assert terms is not None and terms.note == 'left out: 4 of 4 images have no temperature'
 
 
 @pytest.mark.slow
-def test_provenance_tells_all_that_went_in_and_gives_equal_numbers(setup: Setup) -> None:
-    found = solve.solve(ensemble(), setup)
+def test_provenance_tells_all_that_went_in_and_gives_equal_numbers(setup, found) -> None:
     first = found.provenance
     assert first['software'].startswith('starcal ')
     assert first['catalog'] == setup.catalog.digest
@@ -204,31 +205,27 @@ def test_provenance_tells_all_that_went_in_and_gives_equal_numbers(setup: Setup)
     np.testing.assert_array_equal(second.covariance, found.covariance)
     camera, of_first = second.geometry.camera, found.geometry.camera
     np.testing.assert_array_equal(camera.parameters, of_first.parameters)
-    digest = digest_of(list(ensemble().images), setup)
-    assert digest == first['observations_sha256']
-    assert digest_of(list(ensemble().images[::-1]), setup) != digest
-
-
-def digest_of(images: list[StarObservations], setup: Setup) -> str:
-    return provenance_of(setup, Ensemble(tuple(images)))['observations_sha256']
+    assert first['observations_sha256'] == provenance_of(setup, ensemble())['observations_sha256']
 
 
 def test_the_digest_is_of_all_that_a_calibration_is_made_from(setup: Setup) -> None:
-    images = list(ensemble().images)
-    digest = digest_of(images, setup)
-    first = images[0]
-    other = np.roll(first.icrf_from_star_tracker_xyzw, 1)
+    def digest_of(*images: StarObservations) -> str:
+        return provenance_of(setup, Ensemble(images))['observations_sha256']
+
+    first, *others = ensemble().images
+    digest = digest_of(first, *others)
+    assert digest_of(*others, first) != digest
     for changed in (
         {'time_ns': first.time_ns + 1},
-        {'icrf_from_star_tracker_xyzw': other},
+        {'icrf_from_star_tracker_xyzw': np.roll(first.icrf_from_star_tracker_xyzw, 1)},
         {'direction_icrf': -first.direction_icrf},
         {'measured_px': np.nextafter(first.measured_px, np.inf)},
         {'covariance_px2': 2.0 * first.covariance_px2},
         {'catalog_id': first.catalog_id + 1},
         {'temperature_degc': 20.0},
     ):
-        assert digest_of([dataclasses.replace(first, **changed), *images[1:]], setup) != digest
-    assert digest_of([dataclasses.replace(first, psf_sigma_px=3.0), *images[1:]], setup) == digest
+        assert digest_of(dataclasses.replace(first, **changed), *others) != digest
+    assert digest_of(dataclasses.replace(first, psf_sigma_px=3.0), *others) == digest
 
 
 def test_digests_can_be_stopped(tmp_path: Path) -> None:
