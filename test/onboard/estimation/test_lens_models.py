@@ -9,7 +9,7 @@ from geometries import COEFFICIENTS, turned  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from worlds import displaced, estimated, of_random_pointings, WIDTH  # type: ignore[import-not-found]
+from worlds import displaced, estimated, observed, WIDTH  # type: ignore[import-not-found]
 
 from bench.narrow import bound_px, scenario_of
 from starcal_ground import calibrate
@@ -85,34 +85,32 @@ def test_without_noise_the_truth_comes_back(model: str) -> None:
 def test_all_coefficients_of_a_large_model_are_estimated(model: str) -> None:
     """Those of numerator and denominator trade with each other within their weak prior."""
     made = wide(model, seed=4)
-    found = estimate_calibration(
-        true_observations(made), prior_of(made, model), CalibrationOptions()
-    )
+    prior = prior_of(made, model)
+    found = estimate_calibration(true_observations(made), prior, CalibrationOptions())
     assert found.termination == 'converged'
     camera = found.geometry.camera
     sigma_px = map_sigma_px(camera, found.map_covariance)
     assert map_error_px(camera, made.truth.camera) < 2.0 * np.sqrt(np.mean(sigma_px**2)) < 0.03
 
 
+def below(ideal: Floats, coefficients: Floats) -> Floats:
+    """Denominator of the division model of Fitzgibbon, which has one coefficient."""
+    return np.asarray((1.0 + coefficients[0] * (ideal * ideal).sum(axis=-1))[..., None])
+
+
 def division(ideal: Floats, coefficients: Floats) -> Floats:
-    """The division model of Fitzgibbon: one coefficient in the denominator."""
-    r2 = (ideal * ideal).sum(axis=-1)
-    return np.asarray(ideal / (1.0 + coefficients[0] * r2)[..., None])
+    return np.asarray(ideal / below(ideal, coefficients))
 
 
 def division_by_ideal(ideal: Floats, coefficients: Floats) -> Floats:
-    k = coefficients[0]
-    below = 1.0 + k * (ideal * ideal).sum(axis=-1)
     outer = ideal[..., :, None] * ideal[..., None, :]
-    return np.asarray(
-        np.eye(2) / below[..., None, None] - 2.0 * k * outer / (below**2)[..., None, None]
-    )
+    d = below(ideal, coefficients)[..., None]
+    return np.asarray(np.eye(2) / d - 2.0 * coefficients[0] * outer / d**2)
 
 
 def division_by_coefficients(ideal: Floats, coefficients: Floats) -> Floats:
-    r2 = (ideal * ideal).sum(axis=-1)
-    by_k = -ideal * (r2 / (1.0 + coefficients[0] * r2) ** 2)[..., None]
-    return np.asarray(np.moveaxis(by_k, -1, 0)[:, None])
+    r2 = (ideal * ideal).sum(axis=-1)[..., None]
+    return np.asarray(np.moveaxis(-ideal * r2 / below(ideal, coefficients) ** 2, -1, 0)[:, None])
 
 
 def test_a_lens_model_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -148,13 +146,13 @@ def test_a_lens_model_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def test_mirrored_images_are_named() -> None:
-    given = of_random_pointings(3, images=6)
+    given, ensemble = observed(3, images=6)
 
     def mirrored(pixels: Floats) -> Floats:
         return np.stack([WIDTH - 1 - 2.0 * pixels[:, 0], 0.0 * pixels[:, 1]], axis=-1)
 
     with pytest.raises(TooFewObservations, match='^the stars are those of a mirrored image'):
-        estimated(given, displaced(true_observations(given), mirrored))
+        estimated(given, displaced(ensemble, mirrored))
 
 
 @pytest.mark.parametrize('field_deg', [0.3, 2.5])

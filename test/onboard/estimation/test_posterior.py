@@ -7,6 +7,7 @@ import dataclasses
 import functools
 
 from four_images import (  # type: ignore[import-not-found]
+    CAMERA,
     Dense,
     dense,
     HEIGHT,
@@ -122,13 +123,9 @@ def test_the_whole_is_the_mixture_over_the_amplitude_of_the_field() -> None:
     assert result.common_px2[0] > 0
     scale, stretch, _, *decentring = result.common_px2
     half_px = 0.5 * np.hypot(WIDTH, HEIGHT)
-    covariance[[8, 9], [8, 9]] += (
-        np.array(decentring) * (made.state.parameters[0] / half_px**2) ** 2
-    )
-    covariance[0, 0] += scale + stretch
-    covariance[2, 2] += scale + stretch
-    covariance[0, 2] += scale - stretch
-    covariance[2, 0] += scale - stretch
+    covariance[[8, 9], [8, 9]] += np.array(decentring) * (CAMERA.parameters[0] / half_px**2) ** 2
+    covariance[[0, 2], [0, 2]] += scale + stretch
+    covariance[[0, 2], [2, 0]] += scale - stretch
     sigma = np.sqrt(np.diag(covariance))[:P]
     free = np.flatnonzero(sigma)
     assert np.array_equal(np.sort(found.estimated), free)
@@ -201,15 +198,12 @@ def test_what_a_star_lacks_leaves_no_variance_of_a_smear_negative(given: Small) 
     from_sky, n = np.tile(np.eye(2), (len(table), 1, 1)), len(table)
     lacks = SharedError('star places', table.star, np.full(n, 0.4), 9.0, True, 1.0, -0.3)
     more = dataclasses.replace(lacks, beyond_px2=0.3)
-    less, greater = (
-        Weighting(table, from_sky, CentroidVariance(1.0, 0.0), (one,), given.keep, None)
-        for one in (lacks, more)
-    )
-    mean_px2 = smear_px2[:, [0, 2]].mean(axis=1)
-    for one, px2 in ((less, -0.3), (greater, 0.3)):
+    mean_px2, variance = smear_px2[:, [0, 2]].mean(axis=1), CentroidVariance(1.0, 0.0)
+    for error, px2 in ((lacks, -0.3), (more, 0.3)):
+        one = Weighting(table, from_sky, variance, (error,), given.keep, None)
         np.testing.assert_allclose(one.variance_px2, mean_px2 + px2, rtol=1e-12)
         assert (one.covariance_px2[:, [0, 2]] > 0).all()
-    assert greater.covariance_px2[0] == pytest.approx([0.31, 0.0, 1.11])
+    assert one.covariance_px2[0] == pytest.approx([0.31, 0.0, 1.11])
 
 
 Shared = tuple[Weighting, tuple[TrackerErrors, ...]]
@@ -220,9 +214,8 @@ def weighted(
     given: Small, from_sky: Floats, variance_px2: Floats, *errors: SharedError
 ) -> Weighting:
     """Weights of observations of these variances (n,) per axis."""
-    table = dataclasses.replace(
-        given.table, covariance_px2=np.outer(variance_px2, [1.0, 0.0, 1.0])
-    )
+    covariance_px2 = np.outer(variance_px2, [1.0, 0.0, 1.0])
+    table = dataclasses.replace(given.table, covariance_px2=covariance_px2)
     return Weighting(table, from_sky, CentroidVariance(1.0, 0.0), errors, given.keep, None)
 
 
@@ -247,15 +240,12 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[
     variance = (place_px**2 + cell_px**2) * rng.uniform(0.5, 2.0, n)
     weights = weighted(given, from_sky, variance, *errors)
     trackers = []
-    for rows, group in (
-        (np.array([0, 2]), np.array([0, 1])),
-        (np.array([1, 3]), np.zeros(2, int)),
-    ):
+    for rows, group in (([0, 2], np.array([0, 1])), ([1, 3], np.zeros(2, int))):
         half = rng.normal(size=(group.max() + 1, 2))
         covariance = half @ half.T + 0.2 * np.eye(len(half))
         errors_of = TrackerErrors(1.0, 1.0, covariance, group, 1.0, 0.0, '', 0.15)
         sigma_rad = OF_WORKING * given.problem.star_tracker_sigma_rad[rows[0], 0]
-        trackers.append(dataclasses.replace(errors_of, sigma_rad=sigma_rad, images=rows))
+        trackers.append(dataclasses.replace(errors_of, sigma_rad=sigma_rad, images=np.array(rows)))
     several = np.bincount(star[used], minlength=50)[star] > 1
     total = cell_px**2 + place_px**2 * several
     share = np.sqrt(np.minimum(variance / total, 1.0))
@@ -275,6 +265,11 @@ def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[
 
 def widened(given: Small, found: Posterior, errors: Shared) -> Posterior:
     return with_shared_errors(found, given.sums(), given.linear(), *errors, negligible=1e-13)
+
+
+def in_pixels(rows: Floats, covariance: Floats) -> Floats:
+    """Variances of predicted pixels by their derivatives (n, p)."""
+    return np.asarray(np.einsum('ni,ij,nj->n', rows, covariance, rows))
 
 
 def propagated(
@@ -315,27 +310,21 @@ def test_shared_errors_widen_lines_of_sight_as_the_dense_covariance() -> None:
     left = X[:, :P] - X[:, own] @ np.linalg.solve(N, X[:, own].T @ X[:, :P])
     plain = found.covariance - common_shape(given.layout, found.shapes.common_px2)
     parts = propagated(given, truth, plain @ left.T, errors, V)
-    rows = truth.stars[::7, :P]
-
-    def seen_by(covariance: Floats) -> Floats:
-        return np.asarray(np.einsum('ni,ij,nj->n', rows, covariance, rows))
-
-    before, expected = seen_by(found.covariance), seen_by(found.covariance + sum(parts.values()))
+    rows, widened_to = truth.stars[::7, :P], found.covariance + sum(parts.values())
+    before, expected = in_pixels(rows, found.covariance), in_pixels(rows, widened_to)
     seen = before > 0
     assert seen.sum() > 15
     # Modes of the field below a twentieth are left out.
-    assert np.abs(seen_by(after.covariance)[seen] / expected[seen] - 1.0).max() < 0.03
+    assert np.abs(in_pixels(rows, after.covariance)[seen] / expected[seen] - 1.0).max() < 0.03
     assert np.abs(expected[seen] / before[seen] - 1.0).max() > 0.1
     del parts['independent']
     widening = after.errors
     assert widening is not None and set(widening.shared) == set(parts)
     for name, one in widening.shared.items():
-        off = seen_by(widening.root @ one @ widening.root.T) - seen_by(parts[name])
+        off = in_pixels(rows, widening.root @ one @ widening.root.T - parts[name])
         assert np.abs(off[seen] / expected[seen]).max() < 0.03, name
     field = given.layout.places['field']
-    of_field = np.einsum(
-        'ni,ij,nj->n', rows[:, field], after.covariance[field, field], rows[:, field]
-    )
+    of_field = in_pixels(rows[:, field], after.covariance[field, field])
     assert (of_field[seen] > 0.1 * expected[seen]).any()
 
 

@@ -22,10 +22,9 @@ from four_images import (  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from scipy.special import eval_jacobi
-from worlds import each_image, estimated, of_random_pointings  # type: ignore[import-not-found]
+from worlds import each_image, estimated, observed  # type: ignore[import-not-found]
 
 from starcal_ground.planning.plan import prospect, target
-from starcal_ground.simulation.centroids import true_observations
 from starcal_ground.simulation.scenario import Scenario
 from starcal_ros.arrays import Floats, Indices
 from starcal_ros.assessment.budget import sigma_budget, statements
@@ -173,8 +172,6 @@ def test_the_camera_follows_a_large_turn_of_the_alignment(given: Small) -> None:
 
 
 MASS_ICRF = np.array([0.6, 0.8, 0.0])
-
-
 TRUE_ARCSEC = 2.0  # at 90 degrees five hundred times the Sun's: a few images show it
 
 
@@ -201,8 +198,9 @@ def row(sigma_arcsec: float) -> Kind:
     )
 
 
-def deflected(made: Scenario) -> Ensemble:
-    """Observations whose catalog has the stars where they were without the mass."""
+def deflected() -> tuple[Scenario, Ensemble]:
+    """A campaign whose catalog has the stars where they were without the mass."""
+    made, ensemble = observed(3)
 
     def moved(_: int, image: StarObservations) -> dict[str, Floats]:
         e = image.direction_icrf
@@ -210,13 +208,12 @@ def deflected(made: Scenario) -> Ensemble:
         e = e - TRUE_ARCSEC * ARCSECOND_RAD * (e * cosine - MASS_ICRF) / (1.0 - cosine)
         return {'direction_icrf': e / np.linalg.norm(e, axis=1, keepdims=True)}
 
-    return each_image(true_observations(made), moved)  # type: ignore[no-any-return]
+    return made, each_image(ensemble, moved)
 
 
 def solved(monkeypatch: pytest.MonkeyPatch, sigma_arcsec: float) -> Estimate:
     monkeypatch.setitem(unknowns.UNKNOWNS, 'mass', row(sigma_arcsec))
-    made = of_random_pointings(3)
-    return estimated(made, deflected(made))  # type: ignore[no-any-return]
+    return estimated(*deflected())  # type: ignore[no-any-return]
 
 
 def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -240,8 +237,8 @@ def test_an_unknown_is_added_by_a_row(monkeypatch: pytest.MonkeyPatch) -> None:
     (undated,) = statements(both, found, options, has_dates=False)
     assert undated.option == 'deflection_arcsec (and dates: the images have none)'
     assert check_of(found).passed
-    wanted, more = target(found, 'deflection_arcsec'), deflected(of_random_pointings(3)).images[:1]
-    now, after = prospect(found, more, options).variances([0], wanted.squares)
+    wanted, (_, ensemble) = target(found, 'deflection_arcsec'), deflected()
+    now, after = prospect(found, ensemble.images[:1], options).variances([0], wanted.squares)
     assert after < now == pytest.approx(sigma**2)
 
 
