@@ -23,10 +23,8 @@ MISSING = [
 
 @pytest.mark.parametrize(('name', 'extra', 'end'), MISSING)
 def test_the_command_is_that_of_this_interpreter(name: str, extra: str, end: str) -> None:
+    """A module of our own is no package to install."""
     line = missing_package(ModuleNotFoundError(name=name), extra)
     assert line == f'{name} is not installed: {sys.executable} -m {end}'
-
-
-def test_a_module_of_our_own_is_no_package_to_install() -> None:
     with pytest.raises(ModuleNotFoundError):
         missing_package(ModuleNotFoundError(name='starcal_ros.nothing'))

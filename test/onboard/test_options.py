@@ -134,26 +134,19 @@ def parameter_file(folder: Path, text: str) -> Path:
     return path
 
 
+SECTIONS = """
+/**: {ros__parameters: {a: 1, b: 1, c: 1, d: 1}}
+observer: {ros__parameters: {b: 2}}
+/calibrator: {ros__parameters: {c: [3, 4]}}
+/**/observer: {ros__parameters: {d: text}}
+somebody_else: {ros__parameters: {a: 9, e: 9}}
+/space/observer: {ros__parameters: {a: 9}}
+cam0: {ros__parameters: {exposure: 3}}
+"""
+
+
 def test_the_sections_of_the_named_nodes_and_of_all_are_read(tmp_path: Path) -> None:
-    path = parameter_file(
-        tmp_path,
-        """
-/**:
-  ros__parameters: {a: 1, b: 1, c: 1, d: 1}
-observer:
-  ros__parameters: {b: 2}
-/calibrator:
-  ros__parameters: {c: [3, 4]}
-/**/observer:
-  ros__parameters: {d: text}
-somebody_else:
-  ros__parameters: {a: 9, e: 9}
-/space/observer:
-  ros__parameters: {a: 9}
-cam0:
-  ros__parameters: {exposure: 3}
-""",
-    )
+    path = parameter_file(tmp_path, SECTIONS)
     values = read_parameter_file(path, ('observer', 'calibrator'))
     assert values == {'a': 1, 'b': 2, 'c': [3, 4], 'd': 'text'}
     assert read_parameter_file(path, ('nobody',)) == {'a': 1, 'b': 1, 'c': 1, 'd': 1}
@@ -161,22 +154,14 @@ cam0:
 
 def test_the_later_section_wins_as_in_ros(tmp_path: Path) -> None:
     # rclpy of Jazzy says so of this very file: a is 2, not the more specific 1.
-    path = parameter_file(
-        tmp_path, 'foo:\n  ros__parameters: {a: 1}\n/**:\n  ros__parameters: {a: 2}\n'
-    )
-    assert read_parameter_file(path, ('foo',)) == {'a': 2}
+    text = 'foo: {ros__parameters: {a: 1}}\n/**: {ros__parameters: {a: 2}}\n'
+    assert read_parameter_file(parameter_file(tmp_path, text), ('foo',)) == {'a': 2}
 
 
 def test_namespaces_may_enclose_a_node(tmp_path: Path) -> None:
     """As rcl reads them: a level of the file for each part of the name."""
-    text = """
-space:
-  observer:
-    ros__parameters: {a: 1}
-  "**":
-    calibrator: {ros__parameters: {b: 2}}
-"""
-    path = parameter_file(tmp_path, text)
+    nodes = '{observer: {ros__parameters: {a: 1}}, "**": {calibrator: {ros__parameters: {b: 2}}}}'
+    path = parameter_file(tmp_path, f'space: {nodes}')
     assert set(parameter_sections(path)) == {'space/observer', 'space/**/calibrator'}
 
 
@@ -202,11 +187,9 @@ def test_sections_of_a_node(section: str, node: str, applies: bool) -> None:
 @pytest.mark.parametrize('section', ['/space/calibrator', 'calibratr', 'space/calibrator'])
 def test_a_section_that_nobody_reads_is_refused(tmp_path: Path, section: str) -> None:
     """It was passed over without a word, and the node kept its defaults."""
-    path = parameter_file(
-        tmp_path,
-        f'/**:\n  ros__parameters: {{a: 1}}\n{section}:\n  ros__parameters: {{b: 2}}\n'
-        'camera_calibrator:\n  ros__parameters: {c: 3}\n',
-    )
+    parts = {'/**': 'a: 1', section: 'b: 2', 'camera_calibrator': 'c: 3'}
+    text = ''.join(f'{part}: {{ros__parameters: {{{of}}}}}\n' for part, of in parts.items())
+    path = parameter_file(tmp_path, text)
     with pytest.raises(OptionError, match=r"'.*cal.*' is not read: write /\*\*/calibrator"):
         read_parameter_file(path, ('observer', 'calibrator'))
     assert read_parameter_file(path, ('observer',)) == {'a': 1}
@@ -232,35 +215,29 @@ def test_a_file_that_is_none(tmp_path: Path, text: str, says: str) -> None:
         read_parameter_file(tmp_path / 'none.yaml', ('foo',))
 
 
-PATHS = (
+PATHS = {
     'camera_info_url', 'catalog', 'dark_frame', 'flat_field', 'bad_pixel_map', 'state_dir',
     'state_key_file', 'bag',
-)  # fmt: skip
+}  # fmt: skip
 
 
-@pytest.mark.parametrize('name', PATHS)
-def test_a_tilde_is_the_home_folder(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_tilde_is_the_home_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """`state_dir: ~/x` made a folder of the name `~` in the working folder."""
     monkeypatch.setenv('HOME', '/home/of_tests')
     fields = option_fields(*OPTION_CLASSES, *NODE_OPTION_CLASSES, PlayerOptions)
-    assert {field.name for field in fields if field.metadata['is_path']} == set(PATHS)
-    (field,) = (field for field in fields if field.name == name)
-    for given, expected in (
-        ('~/x', '/home/of_tests/x'),
-        ('~', '/home/of_tests'),
-        ('/a/~', '/a/~'),
-        ('', ''),
-        ('package://a/~', 'package://a/~'),
-    ):
-        assert check_value(field, given) == expected
-    with pytest.raises(OptionError, match=f'{name}: .~nobody_here/x.: no home folder of ~nobody'):
-        check_value(field, '~nobody_here/x')
-
-
-def test_a_camera_file_at_home_is_not_looked_for_beside_the_parameter_file(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv('HOME', '/home/of_tests')
-    params = tmp_path / 'params.yaml'
-    params.write_text("/**: {ros__parameters: {camera_info_url: '~/camera.yaml'}}")
-    assert read_values(params)['camera_info_url'] == '/home/of_tests/camera.yaml'
+    paths = [field for field in fields if field.metadata['is_path']]
+    assert {field.name for field in paths} == PATHS
+    for field in paths:
+        for given, expected in (
+            ('~/x', '/home/of_tests/x'),
+            ('~', '/home/of_tests'),
+            *((path, path) for path in ('/a/~', '', 'package://a/~')),
+        ):
+            assert check_value(field, given) == expected
+        says = f'{field.name}: .~nobody_here/x.: no home folder of ~nobody'
+        with pytest.raises(OptionError, match=says):
+            check_value(field, '~nobody_here/x')
+    # A camera file at home is not looked for beside the parameter file.
+    text = "/**: {ros__parameters: {camera_info_url: '~/camera.yaml'}}"
+    camera_url = read_values(parameter_file(tmp_path, text))['camera_info_url']
+    assert camera_url == '/home/of_tests/camera.yaml'

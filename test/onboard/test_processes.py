@@ -83,12 +83,9 @@ print(len(found), max(found))
 
 def test_a_library_that_is_loaded_later_has_one_thread_too() -> None:
     """NumPy and SciPy bring one each."""
-    done = subprocess.run(
-        [sys.executable, '-c', LOADED_LATER],
-        env={**os.environ, 'OPENBLAS_NUM_THREADS': '2'},
-        capture_output=True,
-        text=True,
-    )
+    threads = {**os.environ, 'OPENBLAS_NUM_THREADS': '2'}
+    command = [sys.executable, '-c', LOADED_LATER]
+    done = subprocess.run(command, env=threads, capture_output=True, text=True)
     assert done.stdout.split()[1:] == ['1'], done.stdout + done.stderr
 
 
@@ -99,11 +96,8 @@ def test_the_estimate_of_a_calibration_from_python_is_on_one_thread() -> None:
     def look(frame: FrameType, event: str, _: object) -> None:
         if event == 'call' and '/linalg/' in frame.f_code.co_filename and frame.f_back:
             room = os.path.dirname(frame.f_back.f_code.co_filename)
-            numbers.update(
-                library.get_num_threads()
-                for library in libraries
-                if room.endswith(('estimation', 'assessment'))
-            )
+            if room.endswith(('estimation', 'assessment')):
+                numbers.update(library.get_num_threads() for library in libraries)
 
     records, prior = attacks.observations()[:4], attacks.bag_setup().prior
     sys.setprofile(look)

@@ -184,9 +184,9 @@ def test_errors_are_as_large_as_the_covariance_says() -> None:
     """With outliers; without any, test/onboard/estimation/test_calibrate.py has more trials."""
     methods, share = ('per_image', 'hierarchical'), monte_carlo.OUTLIER_SHARE
     found = here(Design('coverage', 10, (8,), (60,), (20.0,), methods, (share,)))
+    low, high = chi2.ppf([0.005, 0.995], 11 * 10) / 10
     for method in methods:
         row = only(found.summary, method=method)
-        low, high = chi2.ppf([0.005, 0.995], 11 * 10) / 10
         assert (row['low'], row['high']) == pytest.approx((low, high))
         # The field that stars cannot show and a slow error of the star tracker are in the sigma
         # and not in these trials: it is up to 15 % too large.
@@ -213,15 +213,13 @@ def test_bound_is_the_inverse_of_the_whole_normal_matrix() -> None:
         dense[at, at] = N[k][10:, 10:] + G
         dense[at, f : f + 3] = dense[f : f + 3, at] = -G
         dense[f : f + 3, f : f + 3] += G
-    scale = 1 / np.sqrt(np.diag(dense))
-    expected = (np.linalg.inv(dense * np.outer(scale, scale)) * np.outer(scale, scale))[:11, :11]
+    unit = np.sqrt(np.outer(np.diag(dense), np.diag(dense)))
+    expected = (np.linalg.inv(dense / unit) / unit)[:11, :11]
     found = trials.bound('hierarchical', N, tracker_arcsec).matrix
-    estimated = np.ix_(trials.ESTIMATED, trials.ESTIMATED)
-    sigma = np.sqrt(np.diag(expected))
+    found = found[np.ix_(trials.ESTIMATED, trials.ESTIMATED)]
+    unit = np.sqrt(np.outer(np.diag(expected), np.diag(expected)))
     # Condition 1e6 of the scaled matrix times a rounding.
-    np.testing.assert_allclose(
-        found[estimated] / np.outer(sigma, sigma), expected / np.outer(sigma, sigma), atol=1e-8
-    )
+    np.testing.assert_allclose(found / unit, expected / unit, atol=1e-8)
 
 
 def test_per_image_and_single_bound_the_hierarchical() -> None:
@@ -232,9 +230,7 @@ def test_per_image_and_single_bound_the_hierarchical() -> None:
         limit = trials.bound('hierarchical', blocks, tracker_arcsec).matrix
         own = trials.bound(method, blocks, tracker_arcsec).matrix
         # 0.001 arcsec, which stands for none, against the 1 arcsec that the stars know: squared.
-        np.testing.assert_allclose(
-            np.diag(limit)[:10], np.diag(own)[:10], rtol=1e-5, err_msg=method
-        )
+        np.testing.assert_allclose(np.diag(limit)[:10], np.diag(own)[:10], 1e-5, err_msg=method)
 
 
 def test_map_error_leaves_out_a_common_turn() -> None:

@@ -30,9 +30,8 @@ NIGHT = scenario.scenario(paper.NIGHT, seed=3)
 @pytest.fixture(scope='module')
 def ensemble() -> Ensemble:
     """Observations of eighteen frames of the night, without pixels."""
-    return simulated_centroids.true_observations(
-        dataclasses.replace(NIGHT, cadence_s=200.0, image_count=18)
-    )
+    few = dataclasses.replace(NIGHT, cadence_s=200.0, image_count=18)
+    return simulated_centroids.true_observations(few)
 
 
 @pytest.fixture(scope='module')
@@ -55,9 +54,8 @@ def test_the_true_camera_leaves_the_noise(ensemble: Ensemble) -> None:
     judged = judge(NIGHT.truth.camera, ensemble.images, 4.5)
     sigma2 = np.concatenate([i.covariance_px2[:, [0, 2]] for i in ensemble.images])
     # 10^4 numbers; the rotation of an image takes three of its 600 degrees of freedom.
-    assert judged.rms_px(range(len(ensemble.images))) == pytest.approx(
-        np.sqrt(sigma2.mean()), rel=0.03
-    )
+    rms_px = judged.rms_px(range(len(ensemble.images)))
+    assert rms_px == pytest.approx(np.sqrt(sigma2.mean()), rel=0.03)
     assert judged.fits.mean() > 0.999  # 4.5 sigma: 4 in 10^5
     wrong = judge(NIGHT.prior.camera, ensemble.images, 1e9)
     assert wrong.rms_px([0]) > 2 * judged.rms_px([0])
@@ -88,19 +86,18 @@ def test_the_study_shows_what_the_paper_concludes(found: PaperStudy) -> None:
 
 
 def test_one_command_makes_it_all(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The command as it is, with a worker of its own, on the first five frames of the night."""
+    """The command as it is, with a worker of its own, on the first four frames of the night."""
     short = dataclasses.replace(paper.TABLE_1, stars=(20,), tracker_arcsec=(20.0,))
-    night = dataclasses.replace(NIGHT, image_count=5)
+    night = dataclasses.replace(NIGHT, image_count=4)
     monkeypatch.setattr(paper, 'TABLE_1', short)
-    monkeypatch.setattr(paper, 'CALIBRATED_WITH', 4)
+    monkeypatch.setattr(paper, 'CALIBRATED_WITH', 3)
     monkeypatch.setattr(studies, 'scenario', lambda *_: night)  # what counts the frames
     arguments = ['paper', '--trials', '1', '--seed', '3', '--workers', '1']
     assert studies.main([*arguments, '-o', str(tmp_path)]) == 0
     numbers = json.loads((tmp_path / 'paper.json').read_text())
-    assert (numbers['images'], numbers['used'], numbers['others']) == (5, 4, 1)
+    assert (numbers['images'], numbers['used'], numbers['others']) == (4, 3, 1)
     text = (tmp_path / 'paper.md').read_text()
     linked = {tmp_path / name for name in re.findall(r'\((images/paper_\w+\.svg)\)', text)}
     assert 'nan' not in text and linked == {*(tmp_path / 'images').iterdir()}
-    for figure in linked:
-        assert ElementTree.fromstring(figure.read_text()).tag.endswith('svg')
-        assert 'nan' not in figure.read_text()
+    for drawn in (figure.read_text() for figure in linked):
+        assert ElementTree.fromstring(drawn).tag.endswith('svg') and 'nan' not in drawn

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,11 +30,9 @@ def test_wald_foretells_the_rise_of_chi_squared(method: str) -> None:
     estimate = estimate_calibration(ensemble, field.prior, options)
     first, *removals = removal_study(estimate)
     assert (first.removed, first.chi2_rise, first.negligible) == ('', 0.0, True)
-    assert {removal.removed for removal in removals} == set(
-        estimated_parameters(options, 'plumb_bob')
-    )
-    rise = np.array([removal.chi2_rise for removal in removals])
-    wald = np.array([removal.wald for removal in removals])
+    terms = {removal.removed for removal in removals}
+    assert terms == set(estimated_parameters(options, 'plumb_bob'))
+    rise, wald = np.array([(removal.chi2_rise, removal.wald) for removal in removals]).T
     assert wald[0] < 20 and wald[-1] > 1000
     # To first order exact; the camera is nearly linear over what a term of some sigmas moves.  The
     # last two leave a camera of the wrong focal length, which is no small change.
@@ -41,9 +40,8 @@ def test_wald_foretells_the_rise_of_chi_squared(method: str) -> None:
     residual_px = np.array([first.residual_rms_px, *(r.residual_rms_px for r in removals)])
     if method == 'per_image':  # where chi^2 is of stars alone
         from_residuals = np.diff(residual_px**2).cumsum() * 2 * estimate.kept.sum()
-        np.testing.assert_allclose(
-            from_residuals / trials.CENTROID_SIGMA_PX**2, rise, rtol=1e-6, atol=1e-6
-        )
+        from_residuals /= trials.CENTROID_SIGMA_PX**2
+        np.testing.assert_allclose(from_residuals, rise, rtol=1e-6, atol=1e-6)
 
 
 def test_significance_is_of_the_whole_calibration() -> None:
@@ -68,19 +66,14 @@ def test_a_removal_is_a_calibration_that_never_had_the_terms() -> None:
     estimate = estimate_calibration(ensemble, field.prior, options)
     removals = removal_study(estimate)
     gone = [removal.removed for removal in removals[1:4]]
-    held = field.prior.camera.replace(
-        **{name: 0.0 for name in gone if name not in ('fx', 'fy', 'cx', 'cy')}
-    )
-    remaining = tuple(
-        name for name in estimated_parameters(options, 'plumb_bob') if name not in gone
-    )
+    held = field.prior.camera.replace(**dict.fromkeys({*gone} - {'fx', 'fy', 'cx', 'cy'}, 0.0))
+    all_terms = estimated_parameters(options, 'plumb_bob')
+    remaining = tuple(name for name in all_terms if name not in gone)
     # With no star left out by the one or the other.
     assert estimate.kept.all()
-    other = estimate_calibration(
-        ensemble,
-        dataclasses.replace(field.prior, camera=held),
-        dataclasses.replace(options, estimate=remaining, outlier_sigma=20.0),
-    )
+    prior = dataclasses.replace(field.prior, camera=held)
+    fewer = dataclasses.replace(options, estimate=remaining, outlier_sigma=20.0)
+    other = estimate_calibration(ensemble, prior, fewer)
     rms_px = np.sqrt(np.mean(other.residual_px**2))
     # The field and the shapes of the images are those of the calibration with all terms, here
     # those of the one without: they take 1e-5 of the residuals, and some of what is removed.
@@ -100,13 +93,11 @@ def test_terms_that_are_none_are_negligible_and_others_are_not() -> None:
             truth=CameraGeometry(truth, field.truth.star_tracker_from_camera_xyzw),
             direction_icrf=directions @ field.camera_from_icrf.as_matrix(),
         )
-        options = trials.calibration_options(
-            'hierarchical', TRACKER_ARCSEC, estimate=('fx', 'fy', 'k1', 'k2', 'k3')
-        )
+        terms: dict[str, Any] = {'estimate': ('fx', 'fy', 'k1', 'k2', 'k3')}
+        options = trials.calibration_options('hierarchical', TRACKER_ARCSEC, **terms)
         ensemble = trials.observe(field, TRACKER_ARCSEC)
-        held = field.prior.camera.replace(
-            skew=truth.parameters[1], p1=truth.parameters[8], p2=truth.parameters[9]
-        )
+        skew, p1, p2 = truth.parameters[[1, 8, 9]]
+        held = field.prior.camera.replace(skew=skew, p1=p1, p2=p2)
         prior = dataclasses.replace(field.prior, camera=held)
         removals = removal_study(estimate_calibration(ensemble, prior, options))
         said.append({removal.removed: removal for removal in removals})

@@ -224,11 +224,8 @@ def test_an_image_that_loses_all_its_stars_spoils_nothing(method: str) -> None:
     noisy = with_noise(clean(), 1, tracker_of(method))
     wrong = noisy.images[4]
     rng = np.random.default_rng(3)
-    few, anywhere_px = (
-        wrong.select(np.arange(len(wrong)) < 12),
-        rng.uniform(0, [639, 511], (12, 2)),
-    )
-    scattered = dataclasses.replace(few, measured_px=anywhere_px)
+    few = wrong.select(np.arange(len(wrong)) < 12)
+    scattered = dataclasses.replace(few, measured_px=rng.uniform(0, [639, 511], (12, 2)))
     images = (*noisy.images[:4], scattered, *noisy.images[5:])
     found = estimated(Ensemble(images), method)
     left_out = Ensemble((*noisy.images[:4], *noisy.images[5:]))

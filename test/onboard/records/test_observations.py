@@ -14,14 +14,11 @@ from starcal_ros.camera.detector_field import DetectorField, term_count
 from starcal_ros.records import factored_field, MapCovariance, STAR_REFUSALS, StarRefusal
 
 
-def test_codes_fit_their_arrays() -> None:
+def test_codes_fit_their_arrays_and_names_ascend_with_them() -> None:
     """Zero is a star that is used, so that an array of zeros refuses none."""
     assert not StarRefusal.NONE.value and StarRefusal.NONE.label not in STAR_REFUSALS
     np.testing.assert_array_equal(np.array(list(StarRefusal), np.uint8), list(StarRefusal))
-
-
-def test_names_ascend_with_their_codes() -> None:
-    """Messages list the names in order of the codes: as sorted, which is how 0.1 wrote them."""
+    # Messages list the names in order of the codes: as sorted, which is how 0.1 wrote them.
     assert list(STAR_REFUSALS) == sorted(STAR_REFUSALS)
 
 
@@ -50,16 +47,16 @@ def covariance(stars: int, held: bool = False) -> MapCovariance:
 def test_every_sigma_of_a_line_of_sight_holds_to_a_thousandth(stars: int, held: bool) -> None:
     given = covariance(stars, held)
     record = factored_field(FIELD, given)
-    pixels = pixel_grid(CAMERA, 61, 47)
-    expected = line_of_sight_table(CAMERA, given, pixels)
-    found = line_of_sight_table(
-        CAMERA, MapCovariance(record.covariance, record.unresolved_px), pixels
+    pixels, again = (
+        pixel_grid(CAMERA, 61, 47),
+        MapCovariance(record.covariance, record.unresolved_px),
     )
+    expected, found = (line_of_sight_table(CAMERA, one, pixels) for one in (given, again))
     for name in ('sigma_arcsec', 'shape_sigma_arcsec'):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-3)
-    np.testing.assert_allclose(
-        np.diag(record.covariance)[:13], np.diag(given.matrix)[:13], rtol=1e-7
-    )  # exactly zero where held
+    # Exactly zero where held.
+    expected_px2, found_px2 = np.diag(given.matrix)[:13], np.diag(record.covariance)[:13]
+    np.testing.assert_allclose(found_px2, expected_px2, rtol=1e-7)
     assert np.linalg.eigvalsh(record.covariance).min() > -1e-9 * np.trace(record.covariance)
 
 
@@ -82,8 +79,7 @@ def test_a_direction_of_little_variance_is_kept() -> None:
 def test_the_record_is_a_quarter_of_the_square() -> None:
     record = factored_field(FIELD, covariance(300))
     numbers = (record.covariance_factor, record.remainder_unit_px, record.remainder)
-    square = record.covariance.nbytes
-    assert sum(one.nbytes for one in numbers) < 0.25 * square
+    assert sum(one.nbytes for one in numbers) < 0.25 * record.covariance.nbytes
 
 
 def test_a_field_without_variance_has_none() -> None:
