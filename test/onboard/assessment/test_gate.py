@@ -227,7 +227,8 @@ def test_each_limit_of_a_change_trips_alone(limit, geometry, active, expected, r
     # A change from the prior may be larger, as far as it is documented.
     more, factor, note = OF_THE_PRIOR[limit] if active is None else (0.0, 1.0, '')
     value = (check.found - more) / factor
-    at_limit, beyond = (GateOptions(**{limit: value * share}) for share in (1 + 1e-12, 0.99))
+    limits: list[dict[str, Any]] = [{limit: value * (1 + 1e-12)}, {limit: 0.99 * value}]
+    at_limit, beyond = (GateOptions(**row) for row in limits)
     assert reasons(found, at_limit, active) == ()
     assert checks(found, at_limit, active)[limit].note == note
     (reason,) = reasons(found, beyond, active)

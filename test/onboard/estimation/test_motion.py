@@ -119,7 +119,7 @@ def test_an_image_without_a_rate_turns_as_the_others_do(stated: dict[str, object
     """One of them left out the read-out of all: the sigma was too small by 30."""
     made = campaign(ROLLING, 2)
     error_px, sigma_px = of_focal(solved(ROLLING, 2, **stated), made)
-    without = {'star_tracker_rate_rad_s': UNKNOWN}
+    without: dict[str, object] = {'star_tracker_rate_rad_s': UNKNOWN}
     partly = with_fields(made, lambda k: without if k % 3 == 0 else {})
     found = estimate_of(partly, **stated)
     error_px, partly_px = of_focal(found, partly)

@@ -46,8 +46,10 @@ def residuals(rng: Generator, covariance_px2: Floats) -> Floats:
 def estimated(
     residual: Floats, covariance: Floats, magnitude: Any, used: Any = True, freedom: Any = 2.0
 ) -> CentroidVariance:
-    of_stars = (np.broadcast_to(one, len(residual)) for one in (magnitude, used, freedom))
-    return estimate_variance(residual, covariance, *of_stars, 4.5)
+    n = len(residual)
+    magnitudes, are_used = np.broadcast_to(magnitude, n), np.broadcast_to(used, n)
+    freedoms = np.broadcast_to(freedom, n)
+    return estimate_variance(residual, covariance, magnitudes, are_used, freedoms, 4.5)
 
 
 @pytest.mark.parametrize(

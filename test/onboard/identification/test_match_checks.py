@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import re
+from typing import Any
 
 import numpy as np
 import pytest
@@ -162,7 +163,7 @@ def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.n
 
 
 def judged(
-    magnitude: np.ndarray, place: np.ndarray, centroids: Centroids, **changes: np.ndarray
+    magnitude: np.ndarray, place: np.ndarray, centroids: Centroids, **changes: Any
 ) -> np.ndarray:
     """Refusals of the stars of a sky with some columns changed."""
     most_mag = IdentificationOptions().max_brightness_scatter_mag

@@ -180,7 +180,7 @@ def test_one_spoilt_star_is_left_out_by_its_reason(reason, centroid, spoil) -> N
 
 
 def noise(sky: np.ndarray, seed: int) -> np.ndarray:
-    return np.random.default_rng([8, seed]).normal(100, 5, sky.shape).astype(sky.dtype)
+    return np.asarray(np.random.default_rng([8, seed]).normal(100, 5, sky.shape), sky.dtype)
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,7 +139,7 @@ def test_the_psf_is_that_of_stars_not_of_cosmic_rays(rays) -> None:
     assert wrong(found, one) == 0
 
 
-def faint(index: int, **detector: float) -> tuple[Scene, Exposure]:
+def faint(index: int, **detector: Any) -> tuple[Scene, Exposure]:
     """An image of a short exposure: fewer than five of its stars are over 15 sigma."""
     of_small = scenario('small', 1)
     changed = dataclasses.replace(of_small.detector, **detector)

@@ -286,8 +286,8 @@ def test_hot_pixels_found_in_a_sequence_are_not_measured_as_stars(setup) -> None
 
 
 def why_refused(found: StarObservations, star: int) -> str:
-    (code,) = found.refused_reason[found.refused_catalog_id == star]
-    return list(found.refused_stars)[code]
+    (code,) = found.refused_reason[found.refused_catalog_id == star].tolist()
+    return str(list(found.refused_stars)[code])
 
 
 def test_a_saturated_star_is_known_as_such_under_a_dark_frame(camera_yaml, tmp_path) -> None:
