@@ -135,7 +135,6 @@ class Calibrators:
         )
 
     def turn(self, _process: str, degrees: str) -> None:
-        """Turn the mounting of the prior about the boresight."""
         prior, turn = self.setup.prior, Rotation.from_euler('z', float(degrees), degrees=True)
         mounting = (prior.star_tracker_from_camera * turn).as_quat()
         prior = dataclasses.replace(prior, star_tracker_from_camera_xyzw=mounting)

@@ -62,15 +62,11 @@ class ForkedProcess:
 
 
 class ForkedNode(ForkedProcess):
-    """A node with its output in a file."""
-
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         super().__init__(_run, name, arguments, str(log), dict(os.environ))
 
 
 class ForkedChild(child_process.ChildProcess):
-    """A child process that answers calls."""
-
     def __init__(self) -> None:
         requests, self_requests = FORKSERVER.Pipe(duplex=False)
         self_answers, answers = FORKSERVER.Pipe(duplex=False)

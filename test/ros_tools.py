@@ -100,11 +100,9 @@ class RosTools:
         return done.stdout
 
     def start(self, *arguments: str | Path) -> LoggedProcess:
-        """Start `ros2` with these arguments."""
         return self._start([self._ros2, *map(str, arguments)])
 
     def start_node(self, name: str, *ros: str | Path) -> LoggedProcess:
-        """Start a node of starcal with ROS arguments."""
         package = 'starcal_ground' if name in ('bag_player', 'setup_finder') else 'starcal_ros'
         module = f'{package}.ros.{name}'
         return self._start([sys.executable, '-m', module, '--ros-args', *map(str, ros)])

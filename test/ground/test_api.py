@@ -25,7 +25,6 @@ TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 
 
 def arrays(image: StarObservations) -> dict[str, Any]:
-    """The arguments of `observations_of` beside the camera."""
     uu, uv, vv = image.covariance_px2.T
     return {
         'time_ns': image.time_ns,

@@ -32,7 +32,6 @@ UNSOUND = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
 
 
 def unaligned(folder: Path) -> Path:
-    """A bag without a prior alignment."""
     bag = Path(shutil.copytree(TINY, folder / 'bag'))
     params_with(bag, prior_alignment=None)
     return bag

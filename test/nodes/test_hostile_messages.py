@@ -87,7 +87,6 @@ def assert_finite(messages: Iterable[Any]) -> None:
 def assert_requests_are_answered(
     client: Client, kind: Any, name: str, template: Any, process: NodeProcess
 ) -> None:
-    """Mutants of a request are answered with finite numbers."""
     service = client.node.create_client(kind, name)
     client.until(service.service_is_ready)
     for request, _ in mutated(template, 20):

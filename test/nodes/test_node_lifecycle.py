@@ -80,7 +80,6 @@ def test_every_transition_in_every_state(vehicle, state, shut_down) -> None:
 
 
 def run(code: str, *arguments: str) -> tuple[int, str, str]:
-    """Exit status and output of a process that runs some lines."""
     done = run_python('-c', code, *arguments)
     return done.returncode, done.stdout, done.stderr
 

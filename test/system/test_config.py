@@ -252,7 +252,6 @@ def published() -> dict[str, str]:
 
 
 def paths(content: object, key: str = '') -> Iterator[str]:
-    """Message paths of a panel."""
     if isinstance(content, dict):
         for name, value in content.items():
             yield from paths(value, name)

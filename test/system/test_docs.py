@@ -309,7 +309,6 @@ def interface(directions: str) -> dict[str, str]:
 
 
 def check_ros_arguments(words: tuple[str, ...]) -> None:
-    """Remapped topics and parameters exist in the node."""
     names = names_of(*OPTIONS)
     topics = {name.lstrip('/') for name in interface('sub|pub')}
     for before, word in itertools.pairwise(words):

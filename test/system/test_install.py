@@ -62,7 +62,6 @@ def link_distribution(name: str, packages: Path) -> None:
 
 @pytest.fixture(scope='module')
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sources as in a fresh clone."""
     sources = tmp_path_factory.mktemp('build') / 'sources'
     for name in re.findall(r'^graft (.+)', MANIFEST.read_text(), re.MULTILINE):
         shutil.copytree(ROOT / name, sources / name, ignore=shutil.ignore_patterns(*MADE))

@@ -162,7 +162,6 @@ def exists(span: str) -> bool:
 
 
 def is_text(span: str) -> bool:
-    """True for a command, or a message that the code has."""
     return span.split()[0] in ('starcal', 'make', 'bench', 'ros2', 'pip') or span in source()
 
 

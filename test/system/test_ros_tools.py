@@ -75,7 +75,6 @@ def make(tools: Path, tmp_path: Path, has_failed: Callable[[], bool]) -> Iterato
 
 @pytest.fixture(params=[FAST, CYCLONE])
 def ros2(make: Make, request: pytest.FixtureRequest) -> RosTools:
-    """The tools on each middleware in turn."""
     return make(request.param)
 
 

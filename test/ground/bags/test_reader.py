@@ -216,7 +216,6 @@ def test_a_checksum_of_all_data_is_compared(tmp_path, is_stated) -> None:
 
 @pytest.fixture(scope='module')
 def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of many small chunks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typestore_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)

@@ -168,7 +168,6 @@ In ``begun`` may be the record of a failure, or nothing; nowhere else is anythin
 
 @pytest.fixture(scope='module')
 def inputs(tmp_path_factory: pytest.TempPathFactory, tiny_products: Path) -> Path:
-    """A folder with the inputs of the table."""
     folder = tmp_path_factory.mktemp('inputs')
     (folder / 'products').symlink_to(tiny_products)
     for name in ('params.yaml', 'camera.yaml'):

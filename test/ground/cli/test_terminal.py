@@ -22,7 +22,6 @@ print_verdict(False, 'refused')
 
 
 def on_terminal(**environment: str) -> str:
-    """What the lines above write on a terminal."""
     ours, theirs = pty.openpty()
     plain = {k: v for k, v in os.environ.items() if k not in ('NO_COLOR', 'TERM', 'COLUMNS')}
     with subprocess.Popen(

@@ -58,7 +58,6 @@ def eight(pixels: Pixels, noise_dn: float) -> Pixels:
 
 
 def jpeg(pixels: Pixels, quality: int) -> Pixels:
-    """An image in 8 bit, compressed and read again."""
     coded = cv2.imencode('.jpg', pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED))
 

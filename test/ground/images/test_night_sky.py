@@ -313,7 +313,6 @@ def test_stars_on_a_bright_uneven_sky_are_counted(kind) -> None:
 
 @functools.cache
 def found_stars() -> FromStars:
-    """Camera and rotations of three images of the small bag."""
     return from_stars(tiny_images()[:3], load_catalog(), [ideal_camera((640, 512), 1800.0)])
 
 

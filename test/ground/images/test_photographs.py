@@ -225,7 +225,6 @@ def read(path: Path) -> Photograph:
 
 
 def imported(path: Path) -> None:
-    """Read the facts and the pixels of a file as an import does."""
     options = ImageOptions({path.name: 1})
     pixels_of(path, options, common_scale([look(path, options)], options))
 

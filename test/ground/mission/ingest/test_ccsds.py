@@ -49,7 +49,6 @@ def aem(
     head: str = HEAD,
     times: tuple[str, str] = T,
 ) -> str:
-    """An AEM with one attitude at two times."""
     keywords = {
         'CENTER_NAME': 'EARTH',
         'REF_FRAME_A': 'ICRF',
@@ -170,7 +169,6 @@ def oem(version: str, changes: Changes, more: str = '', end: str = '', head: str
 
 
 def state(seconds: float) -> str:
-    """Position and velocity at a time."""
     position = [1.5e8 + VELOCITY_KM_S[0] * seconds, *np.multiply(VELOCITY_KM_S[1:], seconds)]
     return ' '.join(map(repr, map(float, (*position, *VELOCITY_KM_S))))
 
