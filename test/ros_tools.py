@@ -17,6 +17,7 @@ import subprocess
 import sys
 import time
 
+from packaging.requirements import Requirement
 import pytest
 from starcal_tool import run  # type: ignore[import-not-found]
 from vehicle import LoggedProcess, with_log  # type: ignore[import-not-found]
@@ -38,6 +39,23 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 """
 RUN_S = 240.0  # a command of ros2 takes 2 s; busy cores make that much of it
+
+
+def required(installed: metadata.Distribution, extra: str = '') -> set[str]:
+    """Names of the distributions that one needs with one of its extras, directly or not."""
+    found: set[str] = set()
+    waiting = [(installed, extra)]
+    while waiting:
+        distribution, of_extra = waiting.pop()
+        for text in distribution.requires or ():
+            requirement = Requirement(text)
+            if requirement.marker and not requirement.marker.evaluate({'extra': of_extra}):
+                continue
+            name = requirement.name.lower().replace('_', '-')
+            if name not in found:
+                found.add(name)
+                waiting.append((metadata.distribution(name), ''))
+    return found
 
 
 def find_tools(made_once: Callable[..., Path]) -> Path:

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 from mission_files import write_pngs  # type: ignore[import-not-found]
@@ -21,7 +20,6 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import StarObservations
 
 SIGMA_ARCSEC = (10.0, 10.0, 40.0)
-TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 
 
 def arrays(image: StarObservations) -> dict[str, Any]:

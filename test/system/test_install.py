@@ -18,9 +18,8 @@ import sys
 import sysconfig
 from xml.etree import ElementTree
 
-from packaging.requirements import Requirement
 import pytest
-from ros_tools import HIDDEN  # type: ignore[import-not-found]
+from ros_tools import HIDDEN, required  # type: ignore[import-not-found]
 from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,23 +30,6 @@ MADE = ('.*cache*', '.hypothesis', '*.egg-info', '__pycache__', '_build', 'gener
 SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = ('dask', 'distributed', 'sphinx', 'spiceypy')
 PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
-
-
-def required(installed: metadata.Distribution, extra: str) -> set[str]:
-    """Names of the distributions that one needs with one of its extras, directly or not."""
-    found: set[str] = set()
-    waiting = [(installed, extra)]
-    while waiting:
-        distribution, of_extra = waiting.pop()
-        for text in distribution.requires or ():
-            requirement = Requirement(text)
-            if requirement.marker and not requirement.marker.evaluate({'extra': of_extra}):
-                continue
-            name = requirement.name.lower().replace('_', '-')
-            if name not in found:
-                found.add(name)
-                waiting.append((metadata.distribution(name), ''))
-    return found
 
 
 def link_distribution(name: str, packages: Path) -> None:

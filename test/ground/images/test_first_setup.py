@@ -65,7 +65,7 @@ def test_a_bag_of_which_nothing_is_stated(tmp_path, direction, starcal, monkeypa
 
     # The files repeat the calibration.
     again = tmp_path / 'again'
-    given = ['--params', out / 'params.yaml', '-o', again]
+    given = ['--params', out / 'params.yaml', '-o', again, '--no-report']
     assert starcal('calibrate', bag, *given, '--quiet') == (0, '', '')
     first, second = (read_calibration(place / 'calibration.json') for place in (out, again))
     np.testing.assert_allclose(
@@ -120,10 +120,13 @@ def test_photographs_of_which_nothing_is_stated(tmp_path, starcal) -> None:
 
 
 @pytest.mark.slow
-def test_a_bag_on_the_ground_without_a_site_shows_its_air_by_its_stars(tmp_path, starcal) -> None:
+def test_a_bag_on_the_ground_without_a_site_shows_its_air_by_its_stars(
+    tiny_products, tmp_path, starcal
+) -> None:
     """A bag in space: its stars contradict the ground, and the sigma holds half of the air."""
-    given = [TINY, '--params', TINY / 'params.yaml', '--set', 'observer=ground']
-    for command in (['diagnose'], ['calibrate', '-o', tmp_path, '--no-report']):
+    observed = tiny_products / 'observations.mcap'
+    given = ['--params', TINY / 'params.yaml', '--set', 'observer=ground']
+    for command in (['diagnose', TINY], ['calibrate', observed, '-o', tmp_path, '--no-report']):
         status, _, notes = starcal(*command, *given)
         assert status == 0 and 'observer: ground: the stars do not show its air' in notes
     calibration = read_calibration(tmp_path / 'calibration.json')
