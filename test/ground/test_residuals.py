@@ -31,7 +31,6 @@ def residuals(method: str = 'hierarchical') -> Residuals:
 
 @pytest.mark.parametrize('method', METHODS)
 def test_attitude_errors_are_those_of_the_star_tracker(method) -> None:
-    """Whatever the method: the stars show the errors that the simulation has put in."""
     left, put_in = residuals(method), []
     for index in range(SCENARIO.image_count):
         exact, reported = (

@@ -67,7 +67,6 @@ def test_stars_are_where_a_pinhole_camera_has_them(tiny, k1) -> None:
 
 
 def test_images_of_any_kind_are_straightened(tiny, tmp_path, starcal) -> None:
-    """As stored: colours, bits and types; with the camera that they are of then."""
     write_calibration(tiny, tmp_path / 'calibration.json')
     height, width = tiny.geometry.camera.height, tiny.geometry.camera.width
     ramp = np.tile(np.arange(width, dtype=np.uint16), (height, 1))

@@ -183,7 +183,6 @@ def until_told(client: Client, outcome: str, level: bytes) -> None:
 
 
 def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
-    """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
     calibrator = vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
     vehicle.calibrate()
 
@@ -250,7 +249,6 @@ HEIRS = {
 
 @pytest.mark.parametrize('name', HEIRS)
 def test_consumers_return_to_the_prior(vehicle, name, tiny, tmp_path) -> None:
-    """The star observer, the camera of each image, and the monitor; and back to a calibration."""
     values, folder, why = HEIRS[name]
     stored = dataclasses.replace(tiny, number=1, active_since_ns=1)
     with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:

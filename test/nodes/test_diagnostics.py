@@ -87,7 +87,6 @@ def test_images_that_the_middleware_loses_are_counted(vehicle) -> None:
 
 
 def test_calibrator_diagnostics_match_the_document(vehicle, tmp_path) -> None:
-    """While collecting, with a damaged state file, and with an active calibration."""
     history = tmp_path / 'state' / 'calibrations'
     history.mkdir(parents=True)
     (history / '00000001_calibration_00000001.json').write_text('{"schema": 1}')

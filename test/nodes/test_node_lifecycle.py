@@ -59,7 +59,6 @@ def try_everything(manager: Manager, state: str) -> None:
 @pytest.mark.parametrize('shut_down', [False, True])
 @pytest.mark.parametrize('state', PATHS)
 def test_every_transition_in_every_state(vehicle, state, shut_down) -> None:
-    """Each node survives all transitions, and a signal ends it with status 0 in every state."""
     # An interpreter of its own ends with all threads and publishers where the node was active.
     nodes = [vehicle.start(name, 'autostart:=false', forked=state != 'active') for name in BOTH]
     # Each state meets both signals; the two nodes end by the same code.

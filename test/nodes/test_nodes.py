@@ -251,7 +251,6 @@ def test_an_image_waits_for_its_attitude_and_has_the_temperature(vehicle) -> Non
 
 
 def test_overrun_is_answered(vehicle) -> None:
-    """With more images than the queue holds, each is answered, the surplus with overrun."""
     vehicle.start('star_observer', 'attitude_timeout_s:=60.0')
     answers: list[Any] = vehicle.collect(StarObservations, 'observations')
     images = vehicle.publisher(Image, 'image', 50)
@@ -410,7 +409,6 @@ def set_gap(
 
 
 def test_player_loses_nothing(vehicle, tmp_path) -> None:
-    """A bag of large images at full speed arrives completely, in order, with its stamps."""
     random = np.random.default_rng(2)
     with BagWriter(tmp_path / 'large') as writer:
         for k in range(24):
@@ -471,7 +469,6 @@ def test_a_bag_plays_again_by_its_clock(vehicle) -> None:
 
 
 def test_the_policies_name_what_the_nodes_have(vehicle, tmp_path) -> None:
-    """Each security policy allows exactly the topics and services of its node."""
     with BagWriter(tmp_path / 'bag') as writer:
         writer.write_image('/image', ImageRecord(1, np.zeros((2, 2), np.uint8)), 'camera')
         writer.write_attitude('/attitude', 1, np.array([0, 0, 0, 1.0]), 'icrf')

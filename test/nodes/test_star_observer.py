@@ -105,7 +105,6 @@ def attitude_messages(mounted: Rotation, from_ns: int, to_ns: int) -> list[Any]:
 
 
 def test_one_takes_over_from_another(vehicle, tmp_path) -> None:
-    """Every image is used, and the calibration has the alignment to each star tracker."""
     params = parameter_file(vehicle.bag, tmp_path / 'params.yaml')
     bag, samples, shown = tmp_path / 'two', attitudes(), images()[4:]
     with BagWriter(bag) as writer:

@@ -45,7 +45,6 @@ def filled(
 
 @pytest.mark.slow
 def test_a_restart_goes_on_where_it_stood(tmp_path) -> None:
-    """The same solution to the last bit, and the same active calibration."""
     first = filled(observations(), tmp_path)
     first.add(refused_image(5, 8, 8, 'no_stars', ''))
     answer = first.solve()

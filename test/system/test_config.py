@@ -45,7 +45,6 @@ def tool(name: str) -> Any:
 
 
 def test_the_parameter_file_is_up_to_date_and_has_the_defaults() -> None:
-    """It equals the output of tools/write_parameters.py."""
     text = (CONFIG / 'starcal.yaml').read_text()
     assert text == tool('write_parameters').parameter_file()
     content = yaml.safe_load(text)
@@ -173,7 +172,6 @@ def included(path: Path) -> list[Path]:
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_composed_of_launch_alone(path) -> None:
-    """It compiles, imports only launch and launch_ros, and describes every argument."""
     compile(path.read_text(), str(path), 'exec')
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):

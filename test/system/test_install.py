@@ -145,7 +145,6 @@ def test_a_bag_is_calibrated_without_extras(flight_install, tmp_path) -> None:
 @pytest.mark.packaging
 @pytest.mark.slow
 def test_pip_lines_of_the_tutorial(sources) -> None:
-    """Pip accepts each line that installs from the clone, with every extra that it names."""
     lines = re.findall(r'`pip install ([^`]+)`', TUTORIAL.read_text())
     assert '.' in lines and "'.[mission]'" in lines
     pip, offline = (*PIP, 'install', '--dry-run'), (*ALONE, '--no-build-isolation')

@@ -111,7 +111,6 @@ PLACES: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize('name', PLACES)
 def test_an_output_that_names_an_input_is_refused(name, campaign, tmp_path, capsys) -> None:
-    """-o names an input, its folder, or a file of another origin: nothing is changed."""
     prepare, command = PLACES[name]
     here = tmp_path / 'campaign'
     shutil.copytree(campaign, here)
@@ -236,7 +235,6 @@ def test_what_starcal_did_not_write_is_not_replaced(command, campaign, tmp_path,
     ],
 )
 def test_standard_streams_that_are_closed_full_or_abandoned(line, campaign) -> None:
-    """Those of a result, and those of an error."""
     words = line.replace('OUT', str(campaign / 'out'))
     done = run('bash', '-c', f'{sys.executable} -m starcal_ground.cli.main {words}')
     assert 'Traceback' not in done.stdout + done.stderr

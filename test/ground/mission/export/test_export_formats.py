@@ -155,7 +155,6 @@ def test_a_reader_sees_stars_as_far_off_as_the_export_states(
 
 
 def test_other_facts_of_a_camera_are_in_the_files_of_their_readers(tmp_path) -> None:
-    """Size, alignment, stated error and change of the focal length, where a format has them."""
     made = calibration(temperature=True)
     quaternion = made.geometry.star_tracker_from_camera_xyzw
     tracker_from_camera = Rotation.from_quat(quaternion)

@@ -173,7 +173,7 @@ def test_a_bag_that_kills_its_worker_costs_itself(mission, monkeypatch) -> None:
     found = [Task('poison', 'poison'), *fleet.find(str(mission), Cameras())]
     monkeypatch.setattr(fleet, 'compute', kill_on_poison)
     table = Table(mission.parent)
-    assert fleet.update(table, found, workers=2) == fleet.Done(computed=8, failed=1)
+    assert fleet.update(table, found, workers=1) == fleet.Done(computed=8, failed=1)
     errors = [row.error for row in Table(mission.parent).rows() if row.error]
     assert errors == ['ends its worker process, also alone: out of memory?']
 
