@@ -120,7 +120,7 @@ def test_nodes_and_tool_give_the_same_calibration(vehicle, tiny) -> None:
 def test_after_a_second_request_images_of_a_wrong_set_up_are_used(vehicle, tmp_path) -> None:
     """The observer measures the images that matched no star again with the first calibration."""
     bag, out = tmp_path / 'bag', tmp_path / 'out'
-    wrong = ('--seed', '7', '--alignment-error', '1.0', '--focal-error', '6')
+    wrong = ('--seed', '7', '--images', '6', '--alignment-error', '1.0', '--focal-error', '6')
     assert main(['simulate', '--scenario', 'tiny', *wrong, '-o', str(bag)]) == 0
     given = ('--params', str(bag / 'params.yaml'), '--no-report')
     assert main(['calibrate', str(bag), *given, '-o', str(out)]) == 0
@@ -129,7 +129,7 @@ def test_after_a_second_request_images_of_a_wrong_set_up_are_used(vehicle, tmp_p
     vehicle.until_listened()
     vehicle.play(bag)
     found = vehicle.latched(Calibration, 'calibration')
-    for images in (8, 10):
+    for images in (4, 6):
         vehicle.until_images(images)
         vehicle.calibrate()
         vehicle.until(lambda images=images: found and found[-1].images_used == images)
