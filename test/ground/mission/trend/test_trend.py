@@ -277,15 +277,9 @@ def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path, trend) -> Non
     assert re.findall('<h2>([AB])', page) == ['A', 'B']
 
 
-_DOCUMENT = (Path(__file__).parents[4] / 'docs/mission_trend.md').read_text()
+_DOCUMENT = Path(__file__).parents[4] / 'docs/mission_trend.md'
 _PLACE = Path(sys.executable).parent
 _START_S = 240.0
-
-
-def example(language: str, word: str) -> str:
-    fences = re.findall(rf'```{language}\n(.*?)```', _DOCUMENT, re.DOTALL)
-    (found,) = (text for text in fences if word in text)
-    return str(found)
 
 
 @contextlib.contextmanager
@@ -312,7 +306,8 @@ def container(
 def test_the_containers_of_kubernetes_find_each_other() -> None:
     from distributed import Client  # its import takes a second
 
-    cluster = yaml.safe_load(example('yaml', 'DaskCluster'))
+    fences = re.findall(r'```yaml\n(.*?)```', _DOCUMENT.read_text(), re.DOTALL)
+    (cluster,) = (yaml.safe_load(text) for text in fences if 'DaskCluster' in text)
     with socket.create_server(('127.0.0.1', 0)) as free:
         port = free.getsockname()[1]
     address, name = f'tcp://127.0.0.1:{port}', 'starcal-default-worker-1'
