@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrators of several processes that take the steps in the tables of tests."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 import dataclasses

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Processes without the second of processor time that their imports take."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import faulthandler
 import multiprocessing

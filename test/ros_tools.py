@@ -6,8 +6,6 @@ PyPI has none of them. ``STARCAL_ROS2_TOOLS`` names a folder with ``bin/ros2`` a
 without it, ``../shared/ros2tools/install.sh`` beside this repository makes one for Jazzy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from importlib import metadata
 import os

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Nodes that tests start, as processes or in their own, and a client of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import functools

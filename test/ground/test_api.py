@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The public functions: from arrays, from a bag, lines of sight, and how they refuse bad input."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Residuals of a calibration, as they are left, written and read."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What is said of a bag before it is calibrated, held against what a calibration then does."""
 
-from __future__ import annotations
-
 from collections import Counter
 import contextlib
 import dataclasses

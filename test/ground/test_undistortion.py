@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images without distortion: stars where a pinhole camera has them, in files of all kinds."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -5,8 +5,6 @@ The state folder: what was kept comes back, through kills and damage; seals of i
 Files that cannot be read, beside damaged ones: what is not known is not harmed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 import dataclasses

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags whose images are compressed and whose attitudes are poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import itertools
 from pathlib import Path

@@ -7,8 +7,6 @@ active calibration, and failures of a real service; a calibration that is not ac
 what is latched, and what its consumers do.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 from contextlib import closing, contextmanager

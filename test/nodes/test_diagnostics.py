@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the running nodes: keys and levels as in docs/diagnostics.md."""
 
-from __future__ import annotations
-
 import array
 import itertools
 import math

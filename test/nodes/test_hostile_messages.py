@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Malformed messages and requests to real nodes, callers that end, and kills of both nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import contextlib
 import itertools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The image queue, the star trackers that an image waits for, and statistics of a minute."""
 
-from __future__ import annotations
-
 import threading
 import time
 from types import SimpleNamespace

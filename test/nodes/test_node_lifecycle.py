@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every transition in every state of both nodes, and the end by a signal in each state."""
 
-from __future__ import annotations
-
 import ctypes
 import random
 import signal

@@ -5,8 +5,6 @@ Conversions of every record to a generated message, its serialised bytes, and ba
 The log of a node, which quotes texts from messages and bags.
 """
 
-from __future__ import annotations
-
 import array
 import dataclasses
 from typing import Any

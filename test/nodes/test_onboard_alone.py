@@ -5,8 +5,6 @@ The onboard package alone: nodes and a calibration where nothing else can be imp
 Processes import the standard library, ROS, starcal_ros, and what `ONBOARD` needs.
 """
 
-from __future__ import annotations
-
 from importlib import metadata
 import json
 from pathlib import Path

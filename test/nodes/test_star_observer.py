@@ -5,8 +5,6 @@ The star observer: what its threads share, on the node itself.
 As a process with two star trackers, of which the first falls silent.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What a calibrator keeps: in memory, on disk, across restarts, and what it answers."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools

@@ -7,8 +7,6 @@ Launch files are read by their syntax tree: launch is not on PyPI, so they canno
 every panel is placed and shows published fields.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 import configparser

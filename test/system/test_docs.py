@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The documents: commands run, links resolve, tables match the code."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import itertools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bag to products by the tool and by the nodes, against the truth."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

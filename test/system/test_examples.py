@@ -5,8 +5,6 @@ The scripts and the notebook of examples/, run as their reader would.
 Each public function, and each record that a user holds, has an example that runs.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import doctest
 import json

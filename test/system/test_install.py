@@ -5,8 +5,6 @@
 What a vehicle has: packages with a key of rosdep, and a Debian package with these.
 """
 
-from __future__ import annotations
-
 from importlib import metadata
 import json
 import os

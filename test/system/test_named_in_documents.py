@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every file, function, option, message and test that a document names exists."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import functools

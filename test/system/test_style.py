@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Rules of CONTRIBUTING.md that ruff and mypy do not check; which tests `make check` runs."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 import re

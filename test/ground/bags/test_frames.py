@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images with the telemetry of their time, from one pass over a bag in any order."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import sys
 import threading

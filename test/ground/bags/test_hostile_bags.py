@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Hostile bags: definitions of messages, channels without one, names that act on a terminal."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import random
 from typing import Any

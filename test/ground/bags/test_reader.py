@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags: round trips, independent readers and writers, damage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import io
 from pathlib import Path

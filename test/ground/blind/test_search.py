@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Stars identified without attitude: found where they are, refused where they are not."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

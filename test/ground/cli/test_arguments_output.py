@@ -5,8 +5,6 @@ Outputs that name inputs or files of others, and standard streams that are close
 A command that writes is in the table `WRITING`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 import hashlib

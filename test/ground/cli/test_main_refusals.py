@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Command lines and files with a mistake: one line names it, and nothing is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import shlex
 import shutil

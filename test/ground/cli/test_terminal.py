@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What a person sees: on a terminal of its own, and in a pipe."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re

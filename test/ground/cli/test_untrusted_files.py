@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Each argument and option that names a file, given what is no such file: one line, in time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import os
 from pathlib import Path

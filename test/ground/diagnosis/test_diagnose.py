@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Each mistake of a set-up, made on rendered images and on real ones, is named."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Copies of an exposure are recognised; other exposures of the same camera and sky are none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 import re

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal calibrate` of whatever is given: found, assumed, stated; wrong inputs in one line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import re

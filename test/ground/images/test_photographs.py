@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Facts of photographs by their EXIF tags and FITS headers, written by Pillow and Astropy."""
 
-from __future__ import annotations
-
 import bz2
 import calendar
 from collections.abc import Callable, Mapping

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The next pointings of a campaign."""
 
-from __future__ import annotations
-
 import csv
 import dataclasses
 import json

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The report: what it says, that it needs nothing else, and how a real browser shows it."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import json

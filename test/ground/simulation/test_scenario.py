@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Simulated scenarios, scenes and drifts against analytic truth."""
 
-from __future__ import annotations
-
 import dataclasses
 from datetime import datetime, timezone
 import json

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal calibrate` where it fails, where little is given, and on parts of a bag."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import re

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Exported files, read back by OpenCV, yaml and the published equations of their readers."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable
 import dataclasses

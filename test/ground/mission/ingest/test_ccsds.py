@@ -6,8 +6,6 @@ Each case is written here from the standards: CCSDS 504.0-B-1 and B-2, 502.0-B-1
 Its name states the project whose files have the feature, its comment the reason of the result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The command on bags in a store: the client of S3 against a server that answers, or does not."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import gc
 import hashlib

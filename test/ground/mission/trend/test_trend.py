@@ -5,8 +5,6 @@ The command over a folder tree or a URL: rows, increments, workers, poison and v
 Then cameras and parameters from a pattern, and the example for Kubernetes in the documents.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses

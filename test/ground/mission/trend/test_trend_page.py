@@ -5,8 +5,6 @@ The page of a trend: whether each active calibration still holds, and what chang
 In a simulated fleet each camera that drifted or stepped is named, and no other.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 import dataclasses
 import re
