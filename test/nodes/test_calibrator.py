@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The calibrator in the process of the test, and as a process beside its consumers.
-
-Requests at once, new limits, foreign transforms; the client of set_camera_info, which sends each
-active calibration, and failures of a real service; a calibration that is not active any more:
-what is latched, and what its consumers do.
-"""
+"""The calibrator: requests at once, its driver, and its consumers where none is active."""
 
 from collections.abc import Iterator
 import contextlib

@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The onboard package alone: nodes and a calibration where nothing else can be imported.
-
-Processes import the standard library, ROS, starcal_ros, and what `ONBOARD` needs.
-"""
+"""The onboard package with what it needs alone: nodes, a calibration and a consumer of it."""
 
 from importlib import metadata
 import json

@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The star observer: what its threads share, on the node itself.
-
-As a process with two star trackers, of which the first falls silent.
-"""
+"""The star observer: what its threads share, and two star trackers, one of which falls silent."""
 
 from collections.abc import Iterator
 from dataclasses import replace

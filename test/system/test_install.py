@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-`pip install .` without extras, and the packages that the nodes leave out.
-
-What a vehicle has: packages with a key of rosdep, and a Debian package with these.
-"""
+"""`pip install .` without extras, without what rosdep lacks, and as a Debian package."""
 
 from importlib import metadata
 import json

@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Outputs that name inputs or files of others, and standard streams that are closed or full.
-
-A command that writes is in the table `WRITING`.
-"""
+"""Outputs that name inputs or files of others (`WRITING`); streams that are closed or full."""
 
 import argparse
 from collections.abc import Callable

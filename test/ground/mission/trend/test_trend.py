@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The command over a folder tree or a URL: rows, increments, workers, poison and versions.
-
-Then cameras and parameters from a pattern, and the example for Kubernetes in the documents.
-"""
+"""A trend of a folder tree or a URL: rows, increments, workers, poison, versions and cameras."""
 
 from collections.abc import Callable, Iterator
 import contextlib

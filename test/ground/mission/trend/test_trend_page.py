@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The page of a trend: whether each active calibration still holds, and what changed in a fleet.
-
-In a simulated fleet each camera that drifted or stepped is named, and no other.
-"""
+"""The page of a trend: which calibrations still hold, and which cameras of a fleet changed."""
 
 from collections.abc import Mapping, Sequence
 import dataclasses
