@@ -65,11 +65,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def test_compressed_images_are_paced_for_the_node_that_observes(vehicle, bag) -> None:
-    """
-    A queue of twenty overflows where they are not; each is answered once, in order.
-
-    Other subscribers of images and attitudes may start first; the first images were lost.
-    """
+    """Or a queue of twenty overflows; other subscribers of the images may start first."""
     found: list[Any] = vehicle.collect(StarObservations, 'observations')
     vehicle.collect(CompressedImage, '/image/compressed')
     vehicle.collect(PoseStamped, '/attitude')

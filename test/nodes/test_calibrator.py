@@ -215,11 +215,7 @@ def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
 
 
 def test_a_driver_process_that_restarts(vehicle, tmp_path) -> None:
-    """
-    A driver in another process receives the calibration that was active before it started.
-
-    The next one starts at once, while DDS takes the one that was killed as still there.
-    """
+    """The next one starts at once, while DDS takes the one that was killed as still there."""
     vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
     vehicle.calibrate()
     published = vehicle.until_latched(CameraInfo, 'camera_info')

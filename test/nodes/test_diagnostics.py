@@ -183,11 +183,7 @@ IMPLAUSIBLE = 'm/s is faster than any spacecraft: left out; send m/s'
 
 
 def test_velocities_of_no_spacecraft_are_counted_and_logged_once(vehicle) -> None:
-    """
-    NaN, inf and light speed were an error a message in the log, and OK in the diagnostics.
-
-    A velocity that shows a usual mistake was taken without a word.
-    """
+    """They were an error each in the log; one of a usual mistake was taken without a word."""
     observer = vehicle.start('star_observer', ros=REMAPS)
     velocity = vehicle.publisher(TwistStamped, '/spacecraft/velocity')
     vehicle.collect(StarObservations, 'observations')

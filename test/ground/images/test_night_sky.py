@@ -158,12 +158,7 @@ def test_the_axis_of_a_mirror_image_is_that_of_the_file_and_is_in_the_products(
 @pytest.mark.slow
 @pytest.mark.parametrize('camera', [44, 59])
 def test_an_equidistant_lens_is_not_taken_for_a_pinhole(camera) -> None:
-    """
-    Fields of 96 and 103 degrees.
-
-    As a pinhole, which the first resembles, its corners without stars were off by 22 of their
-    sigmas.
-    """
+    """As a pinhole, which the first resembles, its corners without stars were off by 22 sigmas."""
     given, _ = camera_of(camera)
     found = from_stars(images(dataclasses.replace(given, image_count=3)), load_catalog())
     true = given.truth.camera

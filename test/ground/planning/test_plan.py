@@ -182,11 +182,7 @@ def test_the_best_candidate_is_the_one_whose_variance_is_least(ensemble, first) 
 
 
 def test_sigmas_have_the_names_and_units_of_requirements(first) -> None:
-    """
-    An rms has the name of a requirement only if that is on the rms.
-
-    The map has a smaller sigma than lines of sight, which have the alignment.
-    """
+    """The map has a smaller sigma than lines of sight, which have the alignment."""
     covariance = first.posterior.covariance
 
     def planned(name: str, unit: str) -> float:
