@@ -300,11 +300,7 @@ no /clock yet -> a | not activated: the ROS clock is 0
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ACTIVATIONS)
 def test_what_is_activated_passes_the_gate_of_that_moment(name, calibrators) -> None:
-    """
-    The answer says what is active; so it is after a restart, and no file is set aside.
-
-    Readers of the folder get that one, and none where none is active.
-    """
+    """The answer says what is active; so do a restarted node and readers of the folder."""
     steps, active, words = ACTIVATIONS[name]
     calibrators.run('limit 0.3; open A')
     state = calibrators.run(steps)

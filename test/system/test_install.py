@@ -67,11 +67,7 @@ def wheel(unpacked: Path) -> Path:
 
 
 def installed(wheel: Path, folder: Path, extra: str) -> Path:
-    """
-    An environment with starcal and the closure of its requirements, without network.
-
-    starcal is installed by pip; what it requires is linked from this environment.
-    """
+    """An environment with starcal, by pip, and links to what it requires, without network."""
     venv = folder / 'venv'
     made = run_python('-m', 'venv', '--without-pip', venv, cwd=folder)
     if made.returncode:
