@@ -17,7 +17,7 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from starcal_ground.bags import reader
-from starcal_ground.diagnosis import diagnose as diagnosing
+from starcal_ground.blind.images import identify_images
 from starcal_ground.diagnosis.attitude_readings import WireAttitudes
 from starcal_ground.diagnosis.diagnose import CAUSES, diagnose, Diagnosis
 from starcal_ground.parameter_files import read_setup
@@ -571,12 +571,11 @@ def test_a_mistake_is_named_and_nothing_else(changes, causes, words, catalog) ->
 
 def test_stars_as_wide_as_rings_are_identified_in_bins_of_pixels(catalog, monkeypatch) -> None:
     """Of one image, for which nothing is searched with single pixels: it takes long, in vain."""
-    identify = diagnosing.identify_images
 
     def in_bins(images, camera, catalog, guesses, most=0.0):
-        return identify(images, camera, catalog, guesses, most)
+        return identify_images(images, camera, catalog, guesses, most)
 
-    monkeypatch.setattr(diagnosing, 'identify_images', in_bins)
+    monkeypatch.setattr('starcal_ground.diagnosis.diagnose.identify_images', in_bins)
     night = dataclasses.replace(slewing_night(), images=slewing_night().images[1:2])
     found = found_in(blurred(disc(9.0, 5.0), 'no_match')(night), catalog)
     assert (found.cause, found.also) == ('one_shape', ()) and found.mend
