@@ -237,12 +237,14 @@ def test_standard_streams_that_are_closed_full_or_abandoned(line) -> None:
 def test_ctrl_c_in_the_first_two_seconds() -> None:
     """No traceback of starcal: while Python itself starts, its own cannot be prevented."""
     draw = random.Random(15)
-    code = 'import sys; from starcal_ground.cli.entry_point import main; sys.exit(main())'
-    command = [sys.executable, '-c', code, 'diagnose', str(BAG)]
+    code = 'import sys; from starcal_ground.cli.entry_point import main; print(flush=True)'
+    command = [sys.executable, '-c', f'{code}; sys.exit(main())', 'diagnose', str(BAG)]
     for _ in range(many(6)):
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        assert process.stdout is not None
+        process.stdout.readline()  # Python has started, however busy the machine is
         try:
-            process.communicate(timeout=draw.uniform(0.2, 2.0))
+            process.communicate(timeout=draw.uniform(0.05, 1.8))
         except subprocess.TimeoutExpired:
             process.send_signal(signal.SIGINT)
         errors = process.communicate()[1].decode(errors='replace')
