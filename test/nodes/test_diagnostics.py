@@ -56,6 +56,8 @@ def test_observer_says_what_the_document_says(vehicle) -> None:
         attitudes.publish(sample.data)
     vehicle.until_value('images_used', '1')
     vehicle.until_value('attitudes', str(len(samples)))
+    # It is known once the observations are published, which are counted before.
+    vehicle.until(lambda: vehicle.health()[2]['latency_median_s'] != 'none')
     level, text, values = vehicle.health()
     assert (level, text) == (b'\x00', 'observing')
     assert set(values) == documented('star_observer')

@@ -161,7 +161,7 @@ def test_the_remedy_is_named_without_parameters(tmp_path, starcal) -> None:
         lambda few, folder: [few, '--params', params_with(folder, min_images=4)],
         lambda few, folder: [few, '--params', params_with(folder, min_coverage=1.0)],
         lambda few, _: [few, '--set', 'min_images=4'],
-        lambda *_: [REAL_SKY / 'polaris', '--focal-length-mm', 131, '--pixel-size-um', 10],
+        lambda *_: [REAL_SKY / 'polaris'],
     ],
 )
 def test_it_says_that_all_fits_only_of_what_calibrate_accepts(
