@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrators of several processes that take the steps in the tables of tests."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 import dataclasses
@@ -135,7 +133,6 @@ class Calibrators:
         )
 
     def turn(self, _process: str, degrees: str) -> None:
-        """Turn the mounting of the prior about the boresight."""
         prior, turn = self.setup.prior, Rotation.from_euler('z', float(degrees), degrees=True)
         mounting = (prior.star_tracker_from_camera * turn).as_quat()
         prior = dataclasses.replace(prior, star_tracker_from_camera_xyzw=mounting)

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrations to export, with one property each that formats differ in."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Tasks that kill the process that they run in; worker processes import them from here."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import signal

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images through both nodes while nodes are killed, with checks of all published messages."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 import time

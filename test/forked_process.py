@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Processes without the second of processor time that their imports take."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import faulthandler
 import multiprocessing
@@ -62,15 +60,11 @@ class ForkedProcess:
 
 
 class ForkedNode(ForkedProcess):
-    """A node with its output in a file."""
-
     def __init__(self, name: str, arguments: list[str], log: Path) -> None:
         super().__init__(_run, name, arguments, str(log), dict(os.environ))
 
 
 class ForkedChild(child_process.ChildProcess):
-    """A child process that answers calls."""
-
     def __init__(self) -> None:
         requests, self_requests = FORKSERVER.Pipe(duplex=False)
         self_answers, answers = FORKSERVER.Pipe(duplex=False)

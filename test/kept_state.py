@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Writer of a state folder, for tests that kill its process, and a disk that is full."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import contextlib
 import dataclasses

@@ -17,8 +17,6 @@ ACTIVATE, DEACTIVATE = Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEA
 
 
 class Manager:
-    """Client of the lifecycle services of one node."""
-
     def __init__(self, client: Client, name: str) -> None:
         self._client = client
         self._change = client.node.create_client(ChangeState, f'/{name}/change_state')
@@ -38,7 +36,6 @@ class Manager:
         return bool(self._call(self._change, _to(number)).success)
 
     def state(self) -> str:
-        """Label of the present state of the node."""
         return str(self._call(self._get, GetState.Request()).current_state.label)
 
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Malformed messages from hypothesis: wrong fields, truncated and changed bytes."""
 
-from __future__ import annotations
-
 import copy
 import math
 import re

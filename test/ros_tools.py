@@ -6,8 +6,6 @@ PyPI has none of them. ``STARCAL_ROS2_TOOLS`` names a folder with ``bin/ros2`` a
 without it, ``../shared/ros2tools/install.sh`` beside this repository makes one for Jazzy.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from importlib import metadata
 import os
@@ -17,6 +15,7 @@ import subprocess
 import sys
 import time
 
+from packaging.requirements import Requirement
 import pytest
 from starcal_tool import run  # type: ignore[import-not-found]
 from vehicle import LoggedProcess, with_log  # type: ignore[import-not-found]
@@ -38,6 +37,23 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 """
 RUN_S = 240.0  # a command of ros2 takes 2 s; busy cores make that much of it
+
+
+def required(installed: metadata.Distribution, extra: str = '') -> set[str]:
+    """Names of the distributions that one needs with one of its extras, directly or not."""
+    found: set[str] = set()
+    waiting = [(installed, extra)]
+    while waiting:
+        distribution, of_extra = waiting.pop()
+        for text in distribution.requires or ():
+            requirement = Requirement(text)
+            if requirement.marker and not requirement.marker.evaluate({'extra': of_extra}):
+                continue
+            name = requirement.name.lower().replace('_', '-')
+            if name not in found:
+                found.add(name)
+                waiting.append((metadata.distribution(name), ''))
+    return found
 
 
 def find_tools(made_once: Callable[..., Path]) -> Path:
@@ -100,11 +116,9 @@ class RosTools:
         return done.stdout
 
     def start(self, *arguments: str | Path) -> LoggedProcess:
-        """Start `ros2` with these arguments."""
         return self._start([self._ros2, *map(str, arguments)])
 
     def start_node(self, name: str, *ros: str | Path) -> LoggedProcess:
-        """Start a node of starcal with ROS arguments."""
         package = 'starcal_ground' if name in ('bag_player', 'setup_finder') else 'starcal_ros'
         module = f'{package}.ros.{name}'
         return self._start([sys.executable, '-m', module, '--ros-args', *map(str, ros)])

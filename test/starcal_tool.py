@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What commands answer, and the form of each refusal of the tool."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import subprocess
 import sys

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Rows of a trend whose differences are known, and a mission of eight calibrations, a day each."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

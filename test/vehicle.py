@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Nodes that tests start, as processes or in their own, and a client of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 import contextlib
 import functools
@@ -35,8 +33,6 @@ def parameters(folder: Path, *values: str) -> tuple[str, ...]:
 
 
 class LoggedProcess:
-    """A process with its output in a file."""
-
     def __init__(
         self, name: str, log: Path, process: ForkedProcess | subprocess.Popen[bytes]
     ) -> None:
@@ -87,7 +83,6 @@ class LoggedProcess:
 
 
 def with_log(command: Sequence[str], log: Path, **options: Any) -> subprocess.Popen[bytes]:
-    """Start a process that writes all its output to a file."""
     with log.open('wb') as output:
         return subprocess.Popen(
             command,
@@ -99,8 +94,6 @@ def with_log(command: Sequence[str], log: Path, **options: Any) -> subprocess.Po
 
 
 class NodeProcess(LoggedProcess):
-    """A node as a separate process."""
-
     def __init__(self, name: str, log: Path, arguments: list[str], forked: bool) -> None:
         log.touch()
         process: ForkedProcess | subprocess.Popen[bytes]
@@ -132,7 +125,6 @@ def _seen(condition: Callable[..., object]) -> str:
 
 
 def latched_qos() -> Any:
-    """Quality of service of a latched topic."""
     from rclpy.qos import DurabilityPolicy, QoSProfile
 
     return QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -208,7 +200,6 @@ class Client:
         return found
 
     def latched(self, kind: Any, topic: str) -> list[Any]:
-        """Return a list that collects the messages of a latched topic."""
         return self.collect(kind, topic, latched_qos())
 
     def until_latched(self, kind: Any, topic: str) -> list[Any]:
@@ -251,11 +242,9 @@ class Client:
             self._diagnostics.clear()
 
     def until_value(self, key: str, value: str, name: str = 'star_observer') -> None:
-        """Wait for a value in the diagnostics of a node."""
         self.until(lambda: self.health(name)[2].get(key) == value)
 
     def statuses(self) -> list[Any]:
-        """Return a list that collects what a calibrator reports of its images."""
         if self._statuses is None:
             from starcal.msg import EnsembleStatus
 
@@ -295,11 +284,9 @@ class Vehicle(Client):
     def start(
         self, name: str, *values: str, ros: tuple[str, ...] = (), forked: bool = True
     ) -> NodeProcess:
-        """Start a node with further values of parameters and further ROS arguments."""
         return self.start_node(name, *parameters(self.bag, *values), *ros, forked=forked)
 
     def start_filled(self, *values: str) -> NodeProcess:
-        """Start a calibrator and publish the simulated observations of the small bag to it."""
         node = self.start('calibrator', *values)
         self.fill(tiny_observations().images)
         return node
@@ -316,7 +303,6 @@ class Vehicle(Client):
         return player
 
     def calibrate(self) -> None:
-        """Request a calibration, which becomes active."""
         from std_srvs.srv import Trigger
 
         answer = self.call(Trigger, '/calibrator/calibrate')

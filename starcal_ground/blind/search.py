@@ -52,6 +52,8 @@ _A_LOOK_UP = 2  # candidates refined that cost as much as a look-up
 _KNOWN = 0.05  # half range of the focal length from which a field is searched with one
 _LEAST_GAIN = 0.8  # smallest gain, over that of the four stars of a pattern alone
 _CERTAIN_GAIN = 1.5  # such a gain that few false candidates reach and most true ones do
+# Parameters that displace to the right what they displaced to the left in a mirrored image.
+_ODD = ('skew', 'p2', 's1', 's2', 'tau_y')
 
 
 @dataclass
@@ -234,11 +236,9 @@ def mirror(xy_px: Floats, width: int) -> Floats:
 
 def mirrored_camera(camera: CameraModel) -> CameraModel:
     """Camera of the image mirrored left to right."""
-    skew, cx = float(camera.parameters[1]), float(camera.parameters[3])
-    turned = camera.replace(cx=camera.width - 1 - cx, skew=-skew)
-    if 'p2' not in camera.parameter_names:
-        return turned
-    return turned.replace(p2=-float(camera.parameters[9]))
+    values = dict(zip(camera.parameter_names, camera.parameters.tolist(), strict=True))
+    odd = {name: -value for name, value in values.items() if name in _ODD}
+    return camera.replace(cx=camera.width - 1 - values['cx'], **odd)
 
 
 def _fits(

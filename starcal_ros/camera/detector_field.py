@@ -47,20 +47,25 @@ def basis(pixels: Floats, width: int, height: int, octaves: int) -> Floats:
     """Return the functions (n, t) of a field at pixels (n, 2)."""
     pixels = np.asarray(pixels, np.float64)
     terms, _ = cosine_terms(width, height, octaves)
-    along = _waves(pixels, (width, height), terms.max(axis=0))
-    for waves in along:
-        waves[1:] *= math.sqrt(2.0)
-    values = np.empty((len(terms), len(pixels)))
+    return _values(_waves(pixels, (width, height), terms.max(axis=0)), terms).T
+
+
+def _values(along: list[Floats], terms: Integers) -> Floats:
+    """Return the functions (t, n) of their waves; the lower ones of these are scaled in place."""
+    most = terms.max(axis=0) + 1
+    for waves, count in zip(along, most, strict=True):
+        waves[1:count] *= math.sqrt(2.0)
+    values = np.empty((len(terms), along[0].shape[1]))
     for (i, j), row in zip(terms.tolist(), values, strict=True):
         np.multiply(along[0][i], along[1][j], out=row)
-    return values.T
+    return values
 
 
-def basis_products(
+def basis_and_products(
     pixels: Floats, weights: Floats, width: int, height: int, octaves: int
-) -> Floats:
+) -> tuple[Floats, Floats]:
     """
-    Return the products ``phi' diag(w) phi`` (k, t, t) of `basis` at pixels (n, 2).
+    Return `basis` at pixels (n, 2) as phi (t, n), and ``phi diag(w) phi'`` (k, t, t).
 
     For each row w of the weights (k, n).  A product of cosines is half of those of the sum and the
     difference of their angles, so that few sums over the pixels give all: a twelfth of the time.
@@ -73,7 +78,7 @@ def basis_products(
         table = ((along[0] * row) @ along[1].T).ravel()
         values = size * sum(table.take(place) for place in places)
         product[first, second] = product[second, first] = values
-    return products
+    return _values(along, terms), products
 
 
 @functools.lru_cache(maxsize=16)
@@ -98,10 +103,13 @@ def _waves(pixels: Floats, sizes: tuple[int, int], most: Indices) -> list[Floats
     along: list[Floats] = []
     for axis, size in enumerate(sizes):
         x = ((pixels[:, axis] + 0.5) / size - 0.5) / COSINE_DOMAIN + 0.5
-        waves = np.ones((max(int(most[axis]) + 1, 2), len(x)))
+        waves = np.empty((max(int(most[axis]) + 1, 2), len(x)))
+        waves[0] = 1.0
         np.cos(np.pi * x, out=waves[1])
+        twice = 2.0 * waves[1]
         for k in range(2, len(waves)):  # Chebyshev's recursion: a tenth of the time of cosines
-            waves[k] = 2.0 * waves[1] * waves[k - 1] - waves[k - 2]
+            np.multiply(twice, waves[k - 1], out=waves[k])
+            waves[k] -= waves[k - 2]
         along.append(waves)
     return along
 

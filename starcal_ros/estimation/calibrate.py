@@ -36,9 +36,9 @@ from starcal_ros.estimation.options import (
 )
 from starcal_ros.estimation.outliers import dropped_stars
 from starcal_ros.estimation.posterior import (
-    is_settled,
     Posterior,
     posterior,
+    still_to_move,
     Weighting,
     with_shared_errors,
 )
@@ -237,15 +237,18 @@ def _estimate(data: Data, problem: Problem, start: State, ensemble: Ensemble) ->
     judged = Weighting(table, from_sky, variance, (), every, None)
     judged = judge(data, residual_px, np.full(len(table), 2.0), judged, None)
     before: _Round | None = None
+    moved_by: Floats | None = None
     termination = 'iteration_limit'
     share = 1.0
     before_sigma: Floats = np.empty(0)
     for k in range(MOST_ROUNDS):
         last = _round(data, problem, state, judged, residual_px, before, share)
         iterations += 1
-        if before and is_settled(last.posterior, before.posterior):
-            termination = 'converged'
-            break
+        if before:
+            moved_by, left = still_to_move(last.posterior, before.posterior, moved_by)
+            if left.max() <= 1.0:
+                termination = 'converged'
+                break
         after = judge(data, last.residual_px, last.freedom, judged, last.posterior, last.attitudes)
         residual_px, before = last.residual_px, last
         if k < MOST_ROUNDS - 1:

@@ -240,20 +240,17 @@ def star_sums(linear: Linearisation) -> StarSums:
         blocks[chunk.image] = (by_image @ by_image.transpose(0, 1, 3, 2)).sum(axis=0)
         if field is None:
             continue
-        assert field.functions is not None and field.products is not None
-        predicted_px = linear.predicted_px[chunk.row].T
-        phi = field.functions(predicted_px)
+        assert field.products is not None
         wuu, wuv, wvv = chunk.whitener
-        of_image = phi.reshape(t, m, n).transpose(1, 0, 2)
-        for part, columns in (
-            (slice(0, t), wuu * Z[0]),
-            (slice(t, 2 * t), wuv * Z[0] + wvv * Z[1]),
-        ):
-            cross[chunk.image, part] = of_image @ columns.reshape(c, m, n).transpose(1, 2, 0)
         weights = [wuu * wuu, wvv * wvv + wuv * wuv, wuu * wuv][: 3 if wuv.any() else 2]
-        products = field.products(predicted_px, np.stack(weights))
+        phi, products = field.products(linear.predicted_px[chunk.row].T, np.stack(weights))
         for total, part in zip((uu, vv, uv), products, strict=False):
             total += part
+        # Both axes at once: the functions are read once.
+        columns = np.concatenate([wuu * Z[0], wuv * Z[0] + wvv * Z[1]])
+        by_image = columns.reshape(2 * c, m, n).transpose(1, 0, 2)
+        both = by_image @ phi.reshape(t, m, n).transpose(1, 2, 0)
+        cross[chunk.image] = both.reshape(m, 2, c, t).transpose(0, 1, 3, 2).reshape(m, 2 * t, c)
     information = np.block([[uu, uv], [uv.T, vv]])
     return _chained(blocks, information, cross, linear.problem, layout)
 

@@ -414,21 +414,32 @@ class Weighting:
         return self.covariance_px2 + np.outer(self.inflation_px2, [1.0, 0.0, 1.0])
 
 
-def is_settled(found: Posterior, before: Posterior) -> bool:
+def still_to_move(
+    found: Posterior, before: Posterior, moved: Floats | None
+) -> tuple[Floats, Floats]:
     """
-    Return True if new weights moved neither the unknowns nor their covariance.
+    Return how far a round has moved a posterior, and how far it has still to go (n,), (n,).
+
+    By the steps of the unknowns of the state, and the variances of these and of the field, each
+    over the largest that may be left: 1 is settled.  ``moved`` is that of the round before.  Of
+    changes that fall by a factor q, those to come are ``q / (1 - q)`` of the last (Hairer & Wanner
+    1996, IV.8); q is taken to be a half at most.
 
     The weights themselves need not settle: a star at the limit of outliers may come and go for
     ever, and the variance of what no star shows may creep to zero.
     """
-    if np.abs(found.step_sigma).max(initial=0.0) >= STEP_SIGMA:
-        return False
     now, then = (
         np.append(np.diag(C)[one.layout.in_state], np.trace(C[np.ix_(field, field)]))
         for one in (found, before)
         for C, field in [(one.covariance, one.layout.field_at)]
     )
-    return bool(np.allclose(now, then, rtol=NEGLIGIBLE, atol=0.0))
+    known = (now > 0) & (then > 0)
+    grown = np.log(now[known] / then[known]) / math.log1p(NEGLIGIBLE)
+    last = np.abs(np.concatenate([found.step_sigma / STEP_SIGMA, grown]))
+    falls = np.full_like(last, 0.5)
+    if moved is not None and moved.shape == last.shape:
+        np.divide(last, moved, out=falls, where=moved > 2.0 * last)
+    return last, last * falls / (1.0 - falls)
 
 
 def with_shared_errors(

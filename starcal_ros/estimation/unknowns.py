@@ -31,7 +31,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import eval_jacobi
 
 from starcal_ros.arrays import Floats, Indices
-from starcal_ros.camera.detector_field import basis, basis_products, cosine_terms
+from starcal_ros.camera.detector_field import basis, basis_and_products, cosine_terms
 from starcal_ros.camera.lens import LENSES
 from starcal_ros.constants import ARCSECOND_RAD, FASTEST_M_S, SPEED_OF_LIGHT_M_S
 from starcal_ros.estimation.amplitudes import LogPrior
@@ -100,7 +100,8 @@ class Unknown:
     functions : Scalars or None
         q is twice their number: those of u, then those of v.
     products : callable or None
-        Sums (k, t, t) of their products over pixels (2, n) with weights (k, n).
+        Their values (t, n) and the sums (k, t, t) of their products over pixels (2, n) with
+        weights (k, n).
     octave : (q,) or None
         Octave of each coefficient of those functions.
     log_px : LogPrior
@@ -124,7 +125,7 @@ class Unknown:
     turn: Turn | None = None
     of_star: Floats | None = None
     functions: Scalars | None = None
-    products: Callable[[Floats, Floats], Floats] | None = None
+    products: Callable[[Floats, Floats], tuple[Floats, Floats]] | None = None
     octave: Indices | None = None
     log_px: LogPrior = dataclasses.field(default_factory=LogPrior)
     term: Floats | None = None
@@ -573,7 +574,7 @@ def _by_velocity(
     """
     del pixels
     # Columns: ICRF axes in the camera frame.  To take along an axis is much quicker than to index.
-    x, y, z = (np.take(camera_from_icrf[:, k].T, image, axis=1) for k in range(3))
+    x, y, z = np.take(camera_from_icrf.transpose(1, 2, 0), image, axis=2)
     e_x, e_y, e_z = directions / SPEED_OF_LIGHT_M_S
     return np.stack([y * e_z - z * e_y, z * e_x - x * e_z, x * e_y - y * e_x])
 
@@ -609,8 +610,8 @@ def _field(given: EntryInputs) -> Unknown:
     def functions(pixels: Floats) -> Floats:
         return basis(pixels.T, width, height, FIELD_OCTAVES).T
 
-    def products(pixels: Floats, weights: Floats) -> Floats:
-        return basis_products(pixels.T, weights, width, height, FIELD_OCTAVES)
+    def products(pixels: Floats, weights: Floats) -> tuple[Floats, Floats]:
+        return basis_and_products(pixels.T, weights, width, height, FIELD_OCTAVES)
 
     labels = tuple(f'field_{i}_{j}_{axis}_px' for axis in 'uv' for i, j in terms)
     sigma = 1.0 / np.sqrt(np.bincount(octave)[octave])

@@ -1,10 +1,7 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The public functions: from arrays, from a bag, lines of sight, and how they refuse bad input."""
 
-from __future__ import annotations
-
 import dataclasses
-from pathlib import Path
 from typing import Any
 
 from mission_files import write_pngs  # type: ignore[import-not-found]
@@ -21,11 +18,9 @@ from starcal_ros.estimation.options import CalibrationOptions
 from starcal_ros.records import StarObservations
 
 SIGMA_ARCSEC = (10.0, 10.0, 40.0)
-TINY = Path(__file__).parents[2] / 'bags' / 'tiny'
 
 
 def arrays(image: StarObservations) -> dict[str, Any]:
-    """The arguments of `observations_of` beside the camera."""
     uu, uv, vv = image.covariance_px2.T
     return {
         'time_ns': image.time_ns,

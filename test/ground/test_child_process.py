@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Nothing in the current folder is imported, by the tool nor by what it starts."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import sys

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Two calibrations against each other: known differences, OpenCV's lines of sight, chance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 import json

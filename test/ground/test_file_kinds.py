@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What people give in place of an MCAP bag: it is named, with a command that helps and runs."""
 
-from __future__ import annotations
-
 import contextlib
 from pathlib import Path
 import re

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The record of a failed calibration, and files recognised as our own until they are changed."""
 
-from __future__ import annotations
-
 import errno
 import os
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Residuals of a calibration, as they are left, written and read."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 
@@ -31,7 +29,6 @@ def residuals(method: str = 'hierarchical') -> Residuals:
 
 @pytest.mark.parametrize('method', METHODS)
 def test_attitude_errors_are_those_of_the_star_tracker(method) -> None:
-    """Whatever the method: the stars show the errors that the simulation has put in."""
     left, put_in = residuals(method), []
     for index in range(SCENARIO.image_count):
         exact, reported = (

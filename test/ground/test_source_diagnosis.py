@@ -1,10 +1,9 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What is said of a bag before it is calibrated, held against what a calibration then does."""
 
-from __future__ import annotations
-
 from collections import Counter
 import contextlib
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -19,13 +18,16 @@ from starcal_ground.bags import topics
 from starcal_ground.bags.topics import Topics
 from starcal_ground.campaign import Source
 from starcal_ground.cli.arguments import EXIT_REFUSED
+from starcal_ground.diagnosis.attitude_readings import wire_attitudes
 from starcal_ground.diagnosis.bags import refusals
+from starcal_ground.diagnosis.diagnose import Diagnosis, found_alignment
 from starcal_ground.parameter_files import read_setup
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.source_diagnosis import Contents, examine, without_setup
 from starcal_ros.errors import BagError, OptionError
-from starcal_ros.pipeline.setup import Setup
+from starcal_ros.pipeline.setup import load_setup, Setup
 from starcal_ros.records import Image, refused_image
+from starcal_ros.sky.attitude import attitude_sample, AttitudeHistory
 
 PARAMS = TINY / 'params.yaml'
 ASKED = Topics()
@@ -231,3 +233,42 @@ def test_images_after_ten_that_show_a_wrong_set_up_are_not_measured(
     params = params_with(tmp_path, attitude_direction=direction)
     answer = starcal('diagnose', TINY, path, '--params', params)
     assert answer.status == (3 if words.startswith('0') else 0) and words in answer.words
+
+
+def test_two_images_are_too_few_for_an_alignment() -> None:
+    two = Diagnosis('prior_alignment', [0.0, 0.0, 0.0, 1.0], 'x', images=2)
+    assert found_alignment(two) == (None, '2 images agree, 3 are needed.')
+    assert found_alignment(dataclasses.replace(two, images=3))[0] == [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.mark.parametrize('direction', ['st_to_inertial', 'inertial_to_st'])
+def test_the_valid_attitudes_are_looked_at_as_they_were_received(direction) -> None:
+    history = AttitudeHistory()
+    assert wire_attitudes(history, direction).quaternion.shape == (0, 4)
+    sent = {30: [0.6, 0, 0, 0.8], 20: [0, 0, 0, 0.5], 15: [np.nan] * 4, 10: [1.0, 0, 0, 0]}
+    for time_ns, q in sent.items():
+        history.add(time_ns, attitude_sample(time_ns, np.array(q), direction))
+    kept = wire_attitudes(history, direction)
+    assert kept.time_ns.tolist() == [10, 30]
+    np.testing.assert_allclose(kept.quaternion, [sent[10], sent[30]], atol=1e-15)
+
+
+@pytest.mark.slow
+def test_unmatched_images_are_diagnosed_in_a_process_of_its_own(tmp_path, monkeypatch) -> None:
+    # In the folder of an untrusted bag: nothing that lies there is imported.
+    (tmp_path / 'cv2.py').write_text('raise SystemExit(9)')
+    monkeypatch.chdir(tmp_path)
+    answers: list[Diagnosis] = []
+    stated = {'camera_info_url': str(TINY / 'camera.yaml'), 'attitude_direction': 'inertial_to_st'}
+    finder = pytest.importorskip('starcal_ground.ros.setup_finder')  # of ROS
+    unmatched = finder.Unmatched(load_setup(stated), AttitudeHistory(), answers.append)
+    for image in tiny_images()[:3]:
+        unmatched.add(image)
+    assert unmatched._thread is not None
+    unmatched._thread.join()
+    assert [found.cause for found in answers] == ['no_attitude']
+    assert answers[0].evidence[0].startswith('3 of 3 images identified without attitude')
+    unmatched.close()
+    unmatched.add(tiny_images()[0])
+    unmatched._thread.join()
+    assert len(answers) == 1

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images without distortion: stars where a pinhole camera has them, in files of all kinds."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 
@@ -17,17 +15,12 @@ from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.undistortion import straight_camera, undistort_file, undistort_maps
 from starcal_ground.written_files import write_calibration
 from starcal_ros.arrays import Floats
-from starcal_ros.camera import CameraModel, line_of_sight, pixel_grid, project
+from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.formats.products.camera_yaml import read_camera_info
-from starcal_ros.records import Calibration, PIXELS_OF
+from starcal_ros.records import PIXELS_OF
 
 _ELECTRONS = 1e5  # of a star: its brightest pixel has half of the range of the detector
 _HALF_PX = 4
-
-
-def of_camera(made: Calibration, camera: CameraModel) -> Calibration:
-    geometry = dataclasses.replace(made.geometry, camera=camera)
-    return dataclasses.replace(made, geometry=geometry)
 
 
 def centroid_px(values: Any, near_px: Floats) -> Floats:
@@ -58,7 +51,8 @@ def test_stars_are_where_a_pinhole_camera_has_them(tiny, k1) -> None:
         synthetic.scene(given, 1), pixel_px=stars_px, flux_electrons=np.full(30, _ELECTRONS)
     )
     image = rendering.render(given, shown, 1)
-    values = cv2.remap(image.pixels, *undistort_maps(of_camera(tiny, camera)), cv2.INTER_LANCZOS4)
+    made = dataclasses.replace(tiny, geometry=given.truth)
+    values = cv2.remap(image.pixels, *undistort_maps(made), cv2.INTER_LANCZOS4)
     expected_px = project(straight_camera(camera), line_of_sight(camera, stars_px))
     error_px = np.array([centroid_px(values, px) - px for px in expected_px])
     assert np.abs(expected_px - stars_px).max() > 2.0
@@ -67,7 +61,6 @@ def test_stars_are_where_a_pinhole_camera_has_them(tiny, k1) -> None:
 
 
 def test_images_of_any_kind_are_straightened(tiny, tmp_path, starcal) -> None:
-    """As stored: colours, bits and types; with the camera that they are of then."""
     write_calibration(tiny, tmp_path / 'calibration.json')
     height, width = tiny.geometry.camera.height, tiny.geometry.camera.width
     ramp = np.tile(np.arange(width, dtype=np.uint16), (height, 1))

@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The state folder: what was kept comes back, through kills and damage; seals of its files.
-
-Files that cannot be read, beside damaged ones: what is not known is not harmed.
-"""
-
-from __future__ import annotations
+"""The state folder: what was kept comes back, through kills, damage and files without access."""
 
 from collections.abc import Iterator
 import contextlib

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags whose images are compressed and whose attitudes are poses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 import itertools
 from pathlib import Path
@@ -16,7 +14,7 @@ from mission_files import attitudes, images  # type: ignore[import-not-found]
 import pytest
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
-from sample_records import assert_same, observations  # type: ignore[import-not-found]
+from sample_records import assert_same, attitude_message, observations  # type: ignore[import-not-found]
 from sensor_msgs.msg import CompressedImage
 from std_msgs.msg import String
 
@@ -31,7 +29,6 @@ from starcal_ros.formats.messages.message_codec import (
     make_header,
     OBSERVATIONS_TYPE,
     POSE_TYPE,
-    quaternion_to_message,
     stamp_ns,
     TEMPERATURE_TYPE,
 )
@@ -47,15 +44,11 @@ IMAGES = 24  # more than the queue of twenty holds
 
 @pytest.fixture
 def bag(tmp_path: Path) -> Path:
-    zero = make_message('geometry_msgs/msg/Point', x=0.0, y=0.0, z=0.0)
     messages: list[tuple[int, str, str, Any]] = []
     shown, first_ns, last_ns = images()[:8], attitudes()[0][0], attitudes()[-1][0]
     shifts_ns = [turn * (last_ns - first_ns + 10**9) for turn in range(IMAGES // len(shown))]
     for time_ns, xyzw in ((ns + shift_ns, q) for shift_ns in shifts_ns for ns, q in attitudes()):
-        rotation = quaternion_to_message(xyzw, make_message)
-        pose = make_message('geometry_msgs/msg/Pose', position=zero, orientation=rotation)
-        header = make_header(time_ns, 'icrf', make_message)
-        message = make_message(POSE_TYPE, header=header, pose=pose)
+        message = attitude_message(POSE_TYPE, time_ns, xyzw)
         messages.append((time_ns, '/attitude', POSE_TYPE, message))
     for shift_ns, image in itertools.product(shifts_ns, shown):
         message = make_message(
@@ -72,11 +65,7 @@ def bag(tmp_path: Path) -> Path:
 
 
 def test_compressed_images_are_paced_for_the_node_that_observes(vehicle, bag) -> None:
-    """
-    A queue of twenty overflows where they are not; each is answered once, in order.
-
-    Other subscribers of images and attitudes may start first; the first images were lost.
-    """
+    """Or a queue of twenty overflows; other subscribers of the images may start first."""
     found: list[Any] = vehicle.collect(StarObservations, 'observations')
     vehicle.collect(CompressedImage, '/image/compressed')
     vehicle.collect(PoseStamped, '/attitude')

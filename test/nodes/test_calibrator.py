@@ -1,13 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The calibrator in the process of the test, and as a process beside its consumers.
-
-Requests at once, new limits, foreign transforms; the client of set_camera_info, which sends each
-active calibration, and failures of a real service; a calibration that is not active any more:
-what is latched, and what its consumers do.
-"""
-
-from __future__ import annotations
+"""The calibrator: requests at once, its driver, and its consumers where none is active."""
 
 from collections.abc import Iterator
 import contextlib
@@ -183,7 +175,6 @@ def until_told(client: Client, outcome: str, level: bytes) -> None:
 
 
 def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
-    """A missing, silent, refusing and accepting driver: outcome, count and retry of each."""
     calibrator = vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
     vehicle.calibrate()
 
@@ -224,11 +215,7 @@ def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
 
 
 def test_a_driver_process_that_restarts(vehicle, tmp_path) -> None:
-    """
-    A driver in another process receives the calibration that was active before it started.
-
-    The next one starts at once, while DDS takes the one that was killed as still there.
-    """
+    """The next one starts at once, while DDS takes the one that was killed as still there."""
     vehicle.start_filled(f'set_camera_info_service:={SERVICE}')
     vehicle.calibrate()
     published = vehicle.until_latched(CameraInfo, 'camera_info')
@@ -250,7 +237,6 @@ HEIRS = {
 
 @pytest.mark.parametrize('name', HEIRS)
 def test_consumers_return_to_the_prior(vehicle, name, tiny, tmp_path) -> None:
-    """The star observer, the camera of each image, and the monitor; and back to a calibration."""
     values, folder, why = HEIRS[name]
     stored = dataclasses.replace(tiny, number=1, active_since_ns=1)
     with contextlib.closing(Archive(tmp_path / 'state', 'camera')) as archive:

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Diagnostics of the running nodes: keys and levels as in docs/diagnostics.md."""
 
-from __future__ import annotations
-
 import array
 import itertools
 import math
@@ -58,6 +56,8 @@ def test_observer_says_what_the_document_says(vehicle) -> None:
         attitudes.publish(sample.data)
     vehicle.until_value('images_used', '1')
     vehicle.until_value('attitudes', str(len(samples)))
+    # It is known once the observations are published, which are counted before.
+    vehicle.until(lambda: vehicle.health()[2]['latency_median_s'] != 'none')
     level, text, values = vehicle.health()
     assert (level, text) == (b'\x00', 'observing')
     assert set(values) == documented('star_observer')
@@ -87,7 +87,6 @@ def test_images_that_the_middleware_loses_are_counted(vehicle) -> None:
 
 
 def test_calibrator_diagnostics_match_the_document(vehicle, tmp_path) -> None:
-    """While collecting, with a damaged state file, and with an active calibration."""
     history = tmp_path / 'state' / 'calibrations'
     history.mkdir(parents=True)
     (history / '00000001_calibration_00000001.json').write_text('{"schema": 1}')
@@ -186,11 +185,7 @@ IMPLAUSIBLE = 'm/s is faster than any spacecraft: left out; send m/s'
 
 
 def test_velocities_of_no_spacecraft_are_counted_and_logged_once(vehicle) -> None:
-    """
-    NaN, inf and light speed were an error a message in the log, and OK in the diagnostics.
-
-    A velocity that shows a usual mistake was taken without a word.
-    """
+    """They were an error each in the log; one of a usual mistake was taken without a word."""
     observer = vehicle.start('star_observer', ros=REMAPS)
     velocity = vehicle.publisher(TwistStamped, '/spacecraft/velocity')
     vehicle.collect(StarObservations, 'observations')

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Malformed messages and requests to real nodes, callers that end, and kills of both nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 import contextlib
 import itertools
@@ -87,7 +85,6 @@ def assert_finite(messages: Iterable[Any]) -> None:
 def assert_requests_are_answered(
     client: Client, kind: Any, name: str, template: Any, process: NodeProcess
 ) -> None:
-    """Mutants of a request are answered with finite numbers."""
     service = client.node.create_client(kind, name)
     client.until(service.service_is_ready)
     for request, _ in mutated(template, 20):

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Hostile state folders of a calibrator: forged files, and names that are no files of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import contextlib
 import dataclasses

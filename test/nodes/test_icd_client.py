@@ -5,8 +5,6 @@ Test of an integrator: only generated interfaces and the names of the ICD.
 Nothing here imports starcal_ros; the images come from a bag through rosbags.
 """
 
-from __future__ import annotations
-
 import array
 from collections.abc import Iterator
 import json

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The image queue, the star trackers that an image waits for, and statistics of a minute."""
 
-from __future__ import annotations
-
 import threading
 import time
 from types import SimpleNamespace
@@ -192,7 +190,6 @@ def test_a_single_one_has_come_with_the_samples_about_the_image() -> None:
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """Monotonic clock of the queue, set by the test."""
     clock = SimpleNamespace(now_s=100.0)
     monkeypatch.setattr('starcal_ros.ros.image_queue.time.monotonic', lambda: clock.now_s)
     return clock

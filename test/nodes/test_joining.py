@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Memory and state folders joined: what is kept, what is active, and what cannot be joined."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import dataclasses
 import itertools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every transition in every state of both nodes, and the end by a signal in each state."""
 
-from __future__ import annotations
-
 import ctypes
 import random
 import signal
@@ -59,7 +57,6 @@ def try_everything(manager: Manager, state: str) -> None:
 @pytest.mark.parametrize('shut_down', [False, True])
 @pytest.mark.parametrize('state', PATHS)
 def test_every_transition_in_every_state(vehicle, state, shut_down) -> None:
-    """Each node survives all transitions, and a signal ends it with status 0 in every state."""
     # An interpreter of its own ends with all threads and publishers where the node was active.
     nodes = [vehicle.start(name, 'autostart:=false', forked=state != 'active') for name in BOTH]
     # Each state meets both signals; the two nodes end by the same code.
@@ -80,7 +77,6 @@ def test_every_transition_in_every_state(vehicle, state, shut_down) -> None:
 
 
 def run(code: str, *arguments: str) -> tuple[int, str, str]:
-    """Exit status and output of a process that runs some lines."""
     done = run_python('-c', code, *arguments)
     return done.returncode, done.stdout, done.stderr
 

@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Conversions of every record to a generated message, its serialised bytes, and back.
-
-The log of a node, which quotes texts from messages and bags.
-"""
-
-from __future__ import annotations
+"""Records as generated messages, their bytes and back; the log of a node, which quotes texts."""
 
 import array
 import dataclasses

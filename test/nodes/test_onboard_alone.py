@@ -1,20 +1,13 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The onboard package alone: nodes and a calibration where nothing else can be imported.
+"""The onboard package with what it needs alone: nodes, a calibration and a consumer of it."""
 
-Processes import the standard library, ROS, starcal_ros, and the closure of `ONBOARD` alone.
-"""
-
-from __future__ import annotations
-
-from collections.abc import Iterator
 from importlib import metadata
 import json
 from pathlib import Path
 
 from ament_index_python.packages import get_packages_with_prefixes
-from packaging.requirements import Requirement
 import pytest
+from ros_tools import required  # type: ignore[import-not-found]
 from starcal_tool import run_python  # type: ignore[import-not-found]
 from vehicle import BOTH, REMAPS  # type: ignore[import-not-found]
 
@@ -61,27 +54,12 @@ print(json.dumps([found.accepted, found.images_used, sight.tolist()]))
 """
 
 
-def closure(names: tuple[str, ...]) -> Iterator[metadata.Distribution]:
-    """Distributions and those that they need, directly or not."""
-    waiting, known = list(names), set(names)
-    while waiting:
-        distribution = metadata.distribution(waiting.pop())
-        yield distribution
-        for requirement in map(Requirement, distribution.requires or ()):
-            is_needed = not requirement.marker or requirement.marker.evaluate({'extra': ''})
-            if is_needed and requirement.name not in known:
-                known.add(requirement.name)
-                waiting.append(requirement.name)
-
-
 @pytest.fixture
 def onboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The processes that a test starts import nothing that does not fly."""
-    tops = {
-        Path(file.parts[0]).name.partition('.')[0]
-        for distribution in closure(ONBOARD)
-        for file in distribution.files or ()
-    }
+    names = {*ONBOARD}.union(*(required(metadata.distribution(name)) for name in ONBOARD))
+    files = [file for name in names for file in metadata.files(name) or ()]
+    tops = {Path(file.parts[0]).name.partition('.')[0] for file in files}
     allowed = sorted({*tops, *get_packages_with_prefixes(), 'starcal_ros', 'sitecustomize'})
     assert not {*ON_THE_GROUND} & {*allowed}
     (tmp_path / 'sitecustomize.py').write_text(SITECUSTOMIZE.format(allowed=allowed))

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Parameter files in a namespace: each section reaches its node, or is warned of."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

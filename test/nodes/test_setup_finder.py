@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The setup finder beside a star observer: a wrong set-up, and an alignment that is not given."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from geometry_msgs.msg import QuaternionStamped

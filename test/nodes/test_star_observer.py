@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The star observer: what its threads share, on the node itself.
-
-As a process with two star trackers, of which the first falls silent.
-"""
-
-from __future__ import annotations
+"""The star observer: what its threads share, and two star trackers, one of which falls silent."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -105,7 +99,6 @@ def attitude_messages(mounted: Rotation, from_ns: int, to_ns: int) -> list[Any]:
 
 
 def test_one_takes_over_from_another(vehicle, tmp_path) -> None:
-    """Every image is used, and the calibration has the alignment to each star tracker."""
     params = parameter_file(vehicle.bag, tmp_path / 'params.yaml')
     bag, samples, shown = tmp_path / 'two', attitudes(), images()[4:]
     with BagWriter(bag) as writer:

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What a calibrator keeps: in memory, on disk, across restarts, and what it answers."""
 
-from __future__ import annotations
-
 import contextlib
 import dataclasses
 import itertools
@@ -45,7 +43,6 @@ def filled(
 
 @pytest.mark.slow
 def test_a_restart_goes_on_where_it_stood(tmp_path) -> None:
-    """The same solution to the last bit, and the same active calibration."""
     first = filled(observations(), tmp_path)
     first.add(refused_image(5, 8, 8, 'no_stars', ''))
     answer = first.solve()
@@ -303,11 +300,7 @@ no /clock yet -> a | not activated: the ROS clock is 0
 @pytest.mark.slow
 @pytest.mark.parametrize('name', ACTIVATIONS)
 def test_what_is_activated_passes_the_gate_of_that_moment(name, calibrators) -> None:
-    """
-    The answer says what is active; so it is after a restart, and no file is set aside.
-
-    Readers of the folder get that one, and none where none is active.
-    """
+    """The answer says what is active; so do a restarted node and readers of the folder."""
     steps, active, words = ACTIVATIONS[name]
     calibrators.run('limit 0.3; open A')
     state = calibrators.run(steps)

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The benches run with small sizes, and the compared solvers find the same minimum."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

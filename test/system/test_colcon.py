@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The package in a ROS workspace: colcon builds it; messages and a node run from there."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 import re

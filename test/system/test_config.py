@@ -7,8 +7,6 @@ Launch files are read by their syntax tree: launch is not on PyPI, so they canno
 every panel is placed and shows published fields.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 import configparser
@@ -45,7 +43,6 @@ def tool(name: str) -> Any:
 
 
 def test_the_parameter_file_is_up_to_date_and_has_the_defaults() -> None:
-    """It equals the output of tools/write_parameters.py."""
     text = (CONFIG / 'starcal.yaml').read_text()
     assert text == tool('write_parameters').parameter_file()
     content = yaml.safe_load(text)
@@ -173,7 +170,6 @@ def included(path: Path) -> list[Path]:
 
 @pytest.mark.parametrize('path', FILES, ids=lambda path: path.name)
 def test_composed_of_launch_alone(path) -> None:
-    """It compiles, imports only launch and launch_ros, and describes every argument."""
     compile(path.read_text(), str(path), 'exec')
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.ImportFrom):
@@ -252,7 +248,6 @@ def published() -> dict[str, str]:
 
 
 def paths(content: object, key: str = '') -> Iterator[str]:
-    """Message paths of a panel."""
     if isinstance(content, dict):
         for name, value in content.items():
             yield from paths(value, name)

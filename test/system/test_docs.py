@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The documents: commands run, links resolve, tables match the code."""
 
-from __future__ import annotations
-
 import ast
 import dataclasses
 import itertools
@@ -184,7 +182,6 @@ def test_no_command_is_unknown_and_no_subcommand_undocumented() -> None:
 
 @pytest.mark.parametrize('line', TOOL_LINES, ids=lambda line: ' '.join(line.words)[:60])
 def test_the_tool_takes_the_line(line) -> None:
-    """Every command and option in a document exists."""
     words = [re.sub(r'^[NMS]$', '1', word) for word in line.words]  # a number to be given
     args = parser().parse_args(words[1:])  # ends the test where it does not understand
     assert args.command in main.COMMANDS
@@ -198,7 +195,6 @@ RUNNING = sorted({line.document for line in TOOL_LINES if line.runs})
 @pytest.mark.slow
 @pytest.mark.parametrize('document', RUNNING, ids=lambda path: path.name)
 def test_the_commands_of_a_document_run(document, tmp_path, monkeypatch) -> None:
-    """The commands of a document run in order, and write what they name."""
     shutil.copytree(ROOT / 'bags' / 'tiny', tmp_path / 'bags' / 'tiny')
     monkeypatch.chdir(tmp_path)
     for line in TOOL_LINES:
@@ -309,7 +305,6 @@ def interface(directions: str) -> dict[str, str]:
 
 
 def check_ros_arguments(words: tuple[str, ...]) -> None:
-    """Remapped topics and parameters exist in the node."""
     names = names_of(*OPTIONS)
     topics = {name.lstrip('/') for name in interface('sub|pub')}
     for before, word in itertools.pairwise(words):

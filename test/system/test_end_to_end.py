@@ -1,10 +1,7 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bag to products by the tool and by the nodes, against the truth."""
 
-from __future__ import annotations
-
 import dataclasses
-import importlib.util
 import json
 from pathlib import Path
 import signal
@@ -36,12 +33,6 @@ ROOT = Path(__file__).parents[2]
 TINY = ROOT / 'bags' / 'tiny'
 INDEPENDENT = ROOT.parent / 'shared' / 'independent'
 REAL_SKY = ROOT.parent / 'shared' / 'realsky' / 'granasat'
-
-
-needs_interfaces = pytest.mark.skipif(
-    importlib.util.find_spec('rclpy') is None or importlib.util.find_spec('starcal') is None,
-    reason='needs rclpy and the built interfaces',
-)
 
 
 def read_truth(path: Path) -> CameraGeometry:
@@ -171,9 +162,9 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
     assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
 
 
-@needs_interfaces
 @pytest.mark.nodes
 def test_the_demonstration_on_the_real_graph(tmp_path, starcal) -> None:
+    pytest.importorskip('starcal.msg')
     done = starcal('demo', '-o', tmp_path)
     assert done.status == 0, done
     assert 'sigma' in done.out and 'alignment z' in done.out
@@ -183,9 +174,9 @@ def test_the_demonstration_on_the_real_graph(tmp_path, starcal) -> None:
     assert (found.images_used, dict(found.images_refused)) == (10, {})
 
 
-@needs_interfaces
 @pytest.mark.nodes
 def test_a_demonstration_that_is_ended_leaves_no_process(tmp_path) -> None:
+    pytest.importorskip('starcal.msg')
     psutil = pytest.importorskip('psutil')
     command = [sys.executable, '-m', 'starcal_ground.cli.main', 'demo', '-o', str(tmp_path)]
     tool = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)

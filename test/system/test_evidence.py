@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """``bench evidence``: the sigma holds where the world differs; results, page and resumed runs."""
 
-from __future__ import annotations
-
 import json
 import math
 

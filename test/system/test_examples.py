@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The scripts and the notebook of examples/, run as their reader would.
-
-Each public function, and each record that a user holds, has an example that runs.
-"""
-
-from __future__ import annotations
+"""Examples run as their reader would run them: scripts, the notebook, and those of docstrings."""
 
 import dataclasses
 import doctest

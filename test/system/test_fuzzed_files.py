@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Files and messages from outside, spoilt by hypothesis: read, or refused in one line, in time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import contextlib
 import json

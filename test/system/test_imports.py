@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-`starcal_ros` is what the nodes import, each module imports alone, and start-up imports stay small.
-
-See also `make lint`.
-"""
+"""`starcal_ros` is what the nodes import, each module imports alone, and start-up imports few."""
 
 from __future__ import annotations
 

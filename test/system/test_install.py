@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-`pip install .` without extras, and the packages that the nodes leave out.
-
-What a vehicle has: packages with a key of rosdep, and a Debian package with these.
-"""
-
-from __future__ import annotations
+"""`pip install .` without extras, without what rosdep lacks, and as a Debian package."""
 
 from importlib import metadata
 import json
@@ -18,9 +12,8 @@ import sys
 import sysconfig
 from xml.etree import ElementTree
 
-from packaging.requirements import Requirement
 import pytest
-from ros_tools import HIDDEN  # type: ignore[import-not-found]
+from ros_tools import HIDDEN, required  # type: ignore[import-not-found]
 from starcal_tool import run, run_python  # type: ignore[import-not-found]
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,23 +24,6 @@ MADE = ('.*cache*', '.hypothesis', '*.egg-info', '__pycache__', '_build', 'gener
 SDIST = 'from setuptools.build_meta import build_sdist; print(build_sdist(".."))'
 OF_EXTRAS = ('dask', 'distributed', 'sphinx', 'spiceypy')
 PIP, ALONE = (sys.executable, '-m', 'pip'), ('--no-deps', '--no-index')
-
-
-def required(installed: metadata.Distribution, extra: str) -> set[str]:
-    """Names of the distributions that one needs with one of its extras, directly or not."""
-    found: set[str] = set()
-    waiting = [(installed, extra)]
-    while waiting:
-        distribution, of_extra = waiting.pop()
-        for text in distribution.requires or ():
-            requirement = Requirement(text)
-            if requirement.marker and not requirement.marker.evaluate({'extra': of_extra}):
-                continue
-            name = requirement.name.lower().replace('_', '-')
-            if name not in found:
-                found.add(name)
-                waiting.append((metadata.distribution(name), ''))
-    return found
 
 
 def link_distribution(name: str, packages: Path) -> None:
@@ -62,7 +38,6 @@ def link_distribution(name: str, packages: Path) -> None:
 
 @pytest.fixture(scope='module')
 def sources(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The sources as in a fresh clone."""
     sources = tmp_path_factory.mktemp('build') / 'sources'
     for name in re.findall(r'^graft (.+)', MANIFEST.read_text(), re.MULTILINE):
         shutil.copytree(ROOT / name, sources / name, ignore=shutil.ignore_patterns(*MADE))
@@ -92,11 +67,7 @@ def wheel(unpacked: Path) -> Path:
 
 
 def installed(wheel: Path, folder: Path, extra: str) -> Path:
-    """
-    An environment with starcal and the closure of its requirements, without network.
-
-    starcal is installed by pip; what it requires is linked from this environment.
-    """
+    """An environment with starcal, by pip, and links to what it requires, without network."""
     venv = folder / 'venv'
     made = run_python('-m', 'venv', '--without-pip', venv, cwd=folder)
     if made.returncode:
@@ -164,7 +135,6 @@ def test_a_bag_is_calibrated_without_extras(flight_install, tmp_path) -> None:
 @pytest.mark.packaging
 @pytest.mark.slow
 def test_pip_lines_of_the_tutorial(sources) -> None:
-    """Pip accepts each line that installs from the clone, with every extra that it names."""
     lines = re.findall(r'`pip install ([^`]+)`', TUTORIAL.read_text())
     assert '.' in lines and "'.[mission]'" in lines
     pip, offline = (*PIP, 'install', '--dry-run'), (*ALONE, '--no-build-isolation')

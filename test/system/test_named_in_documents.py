@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every file, function, option, message and test that a document names exists."""
 
-from __future__ import annotations
-
 import ast
 import builtins
 import functools
@@ -162,7 +160,6 @@ def exists(span: str) -> bool:
 
 
 def is_text(span: str) -> bool:
-    """True for a command, or a message that the code has."""
     return span.split()[0] in ('starcal', 'make', 'bench', 'ros2', 'pip') or span in source()
 
 

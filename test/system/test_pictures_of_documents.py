@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The commands that draw the pictures of the documents, run in the small."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 import re

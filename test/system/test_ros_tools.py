@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes and launch files with the real ROS 2 tools, on Fast DDS and on Cyclone DDS."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses
@@ -75,7 +73,6 @@ def make(tools: Path, tmp_path: Path, has_failed: Callable[[], bool]) -> Iterato
 
 @pytest.fixture(params=[FAST, CYCLONE])
 def ros2(make: Make, request: pytest.FixtureRequest) -> RosTools:
-    """The tools on each middleware in turn."""
     return make(request.param)
 
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Rules of CONTRIBUTING.md that ruff and mypy do not check; which tests `make check` runs."""
 
-from __future__ import annotations
-
 import ast
 from pathlib import Path
 import re
@@ -93,7 +91,7 @@ def test_each_file_names_the_holder_and_the_licence_of_the_package() -> None:
         # Imported by no test, but by the package that the tests import.
         ('starcal_ros/records/calibration.py', 'test/onboard/records/test_observations.py'),
         # Loaded by name.
-        ('starcal_ground/cli/commands/plan.py', 'test/ground/cli/commands/test_plan.py'),
+        ('starcal_ground/cli/commands/plan.py', 'test/ground/planning/test_plan.py'),
         ('test/flight.py', 'test/nodes/test_hostile_messages.py'),  # a helper of tests
         ('test/onboard/test_text.py', 'test/onboard/test_text.py'),
     ],

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images with the telemetry of their time, from one pass over a bag in any order."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import sys
 import threading
@@ -42,7 +40,6 @@ def recording() -> list[Recorded]:
 
 
 def write(path: Path, messages: list[Recorded], size: int = 4) -> Path:
-    """Write messages in the order given."""
     random = np.random.default_rng(3)
     with BagWriter(path) as writer:
         for kind, tenths in messages:
@@ -87,7 +84,6 @@ def compared(paths: list[Path]) -> tuple[int, int, list[str]]:
 
 @pytest.fixture
 def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Bags are written in many small chunks."""
     monkeypatch.setattr(typestore, '_CHUNK_BYTES', 600)
 
 

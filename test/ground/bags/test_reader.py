@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Bags: round trips, independent readers and writers, damage."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import io
 from pathlib import Path
@@ -73,7 +71,6 @@ def attitudes_of(path: Path, on_damage: Damage, topic: str = '/attitude') -> Att
 @pytest.mark.parametrize('compression', CompressionType)
 @pytest.mark.parametrize('name', ['b', 'b.mcap'])
 def test_round_trip(tmp_path, monkeypatch, compression, name) -> None:
-    """Records survive writing and reading, as a folder and as a file, however compressed."""
     monkeypatch.setattr(typestore_module, '_COMPRESSION', compression)
     path = write_bag(tmp_path / name)
     assert (tmp_path / name).is_file() == name.endswith('.mcap')
@@ -98,7 +95,6 @@ def test_round_trip(tmp_path, monkeypatch, compression, name) -> None:
 
 
 def test_read_by_rosbags(folder) -> None:
-    """An independent reader finds every message, its type and its stamp."""
     with AnyReader([folder]) as reader:
         assert reader.message_count == 36
         image = next(c for c in reader.connections if c.topic == '/image')
@@ -216,7 +212,6 @@ def test_a_checksum_of_all_data_is_compared(tmp_path, is_stated) -> None:
 
 @pytest.fixture(scope='module')
 def small_chunks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A bag of many small chunks."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(typestore_module, '_CHUNK_BYTES', 800)
         folder = write_bag(tmp_path_factory.mktemp('bag') / 'small', images=8, size=8)
@@ -384,7 +379,6 @@ def test_messages_compressed_one_by_one_are_read(tmp_path, folder, monkeypatch) 
     ],
 )
 def test_bags_of_others(name, images, shape, dtype) -> None:
-    """Bags by other writers are read completely, without reports of damage."""
     said: list[str] = []
     path = SHARED / name
     if not path.exists():

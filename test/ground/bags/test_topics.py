@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attitudes of other types in a bag, and colour images."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Stars identified without attitude: found where they are, refused where they are not."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -36,6 +34,7 @@ from starcal_ground.blind.search import (
 from starcal_ground.blind.sky_fit import _chance_of_order, FOUND, mutual, SourceImage, STATED
 from starcal_ros.arrays import Floats
 from starcal_ros.camera import CameraModel, line_of_sight, project
+from starcal_ros.camera.lens import LENSES
 from starcal_ros.sky.catalog import load_catalog, StarCatalog
 
 
@@ -104,8 +103,11 @@ def test_too_few_sources_or_stars_of_a_catalog_identify_nothing(catalog) -> None
     assert find_sky(frame.xy_px, frame.prior, few, try_mirrored=True) is None
 
 
-def test_a_mirrored_camera_sees_mirrored_stars() -> None:
-    prior = camera(25).replace(cx=500.0, p2=1e-3, skew=0.5)
+@pytest.mark.parametrize('model', LENSES)
+def test_a_mirrored_camera_sees_mirrored_stars(model: str) -> None:
+    lens = 1e-3 * np.arange(1, len(LENSES[model].coefficients) + 1)
+    plain = camera(25).replace(cx=500.0, skew=0.5)
+    prior = CameraModel(1024, 820, np.concatenate([plain.parameters[:5], lens]), model)
     pixels = np.random.default_rng(1).uniform([0, 0], [1024, 820], (18, 2))
     mirrored = line_of_sight(prior, pixels) * [-1.0, 1.0, 1.0]
     seen = project(mirrored_camera(prior), mirrored)

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Inputs and products of a campaign, for commands that read and write them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 import shutil

@@ -7,8 +7,6 @@ operation of a run on a file in it: a SIGKILL at that instant would leave this. 
 interrupted there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 import contextlib
 import dataclasses

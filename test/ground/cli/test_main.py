@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The tool from a user's side: exit status, one line for bad input, never a traceback."""
 
-from __future__ import annotations
-
 import argparse
 from collections import Counter
 import importlib.util

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Command lines and files with a mistake: one line names it, and nothing is written."""
 
-from __future__ import annotations
-
 from pathlib import Path
 import shlex
 import shutil
@@ -168,7 +166,6 @@ In ``begun`` may be the record of a failure, or nothing; nowhere else is anythin
 
 @pytest.fixture(scope='module')
 def inputs(tmp_path_factory: pytest.TempPathFactory, tiny_products: Path) -> Path:
-    """A folder with the inputs of the table."""
     folder = tmp_path_factory.mktemp('inputs')
     (folder / 'products').symlink_to(tiny_products)
     for name in ('params.yaml', 'camera.yaml'):

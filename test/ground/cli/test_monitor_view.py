@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The view of running nodes: what it shows of what was received."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 import contextlib
 import dataclasses

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What a person sees: on a terminal of its own, and in a pipe."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re
@@ -22,7 +20,6 @@ print_verdict(False, 'refused')
 
 
 def on_terminal(**environment: str) -> str:
-    """What the lines above write on a terminal."""
     ours, theirs = pty.openpty()
     plain = {k: v for k, v in os.environ.items() if k not in ('NO_COLOR', 'TERM', 'COLUMNS')}
     with subprocess.Popen(

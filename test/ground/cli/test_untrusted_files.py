@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Each argument and option that names a file, given what is no such file: one line, in time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import os
 from pathlib import Path
@@ -103,4 +101,5 @@ def test_a_file_that_is_none_costs_one_line(name, kind, campaign, tmp_path, star
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < _MOST_BYTES // 1024
     if answer.status == 0 and name in MAY_LACK:
         return
-    assert_refused(answer, 'not a regular file' if kind in ('pipe', 'device') else '')
+    in_folder = Path(PLACES.get(name, '')).name  # which the command does not name
+    assert_refused(answer, in_folder, 'not a regular file' if kind in ('pipe', 'device') else '')

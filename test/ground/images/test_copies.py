@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Copies of an exposure are recognised; other exposures of the same camera and sky are none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 import re
@@ -58,7 +56,6 @@ def eight(pixels: Pixels, noise_dn: float) -> Pixels:
 
 
 def jpeg(pixels: Pixels, quality: int) -> Pixels:
-    """An image in 8 bit, compressed and read again."""
     coded = cv2.imencode('.jpg', pixels, [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
     return np.asarray(cv2.imdecode(coded, cv2.IMREAD_UNCHANGED))
 

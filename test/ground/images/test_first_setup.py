@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal calibrate` of whatever is given: found, assumed, stated; wrong inputs in one line."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 import re
@@ -62,12 +60,17 @@ def test_a_bag_of_which_nothing_is_stated(tmp_path, direction, starcal, monkeypa
     # Five sigma of a fit to the brightest stars with 0.3 px each: 1801 px to 0.1 %.
     assert setup.prior.camera.parameters[0] == pytest.approx(TRUTH['k_true'][0], rel=1e-3)
     assert ('observer' in (out / 'params.yaml').read_text()) is not is_plain  # it has velocities
+    first = read_calibration(out / 'calibration.json')
+    # Ten images give a sigma to 24 %; truth is 10, 10 and 40 arcsec about axes that stars show to
+    # some arcseconds.
+    assert (np.array([4, 4, 15]) < first.star_tracker_sigma_arcsec).all()
+    assert (first.star_tracker_sigma_arcsec < np.array([25, 25, 80])).all()
 
     # The files repeat the calibration.
     again = tmp_path / 'again'
-    given = ['--params', out / 'params.yaml', '-o', again]
+    given = ['--params', out / 'params.yaml', '-o', again, '--no-report']
     assert starcal('calibrate', bag, *given, '--quiet') == (0, '', '')
-    first, second = (read_calibration(place / 'calibration.json') for place in (out, again))
+    second = read_calibration(again / 'calibration.json')
     np.testing.assert_allclose(
         second.geometry.camera.parameters, first.geometry.camera.parameters, rtol=1e-6, atol=1e-6
     )
@@ -104,8 +107,8 @@ def test_streaks_that_are_measured_are_identified_too(tmp_path, starcal) -> None
 @pytest.mark.slow
 def test_photographs_of_which_nothing_is_stated(tmp_path, starcal) -> None:
     night, out = write_pngs(tmp_path / 'night', frames_of(3)), tmp_path / 'out'
-    command = ['calibrate', night, '-o', out, '--no-report']
-    status, text, notes = starcal(*command, '--focal-length-mm', 50, '--pixel-size-um', 10)
+    stated = ['--focal-length-mm', 50, '--pixel-size-um', 10]
+    status, text, notes = starcal('calibrate', night, '-o', out, '--no-report', *stated)
     assert status in (0, 3)
     assert 'px (stated: 5000 px, which the stars contradict)' in notes
     assert 'observer: assumed by the stars' in text and 'star_tracker' not in text
@@ -113,17 +116,16 @@ def test_photographs_of_which_nothing_is_stated(tmp_path, starcal) -> None:
     status, text, _ = starcal('diagnose', night, *LENS)
     assert status == 0
     assert 'the camera alone can be calibrated' in text and '3 of 3 images' in text
-    with (out / 'params.yaml').open('a') as file:
-        file.write('    shutter: global\n')
-    changed = 'params.yaml: was not written by starcal, or was changed'
-    assert_refused(starcal(*command, *LENS), changed)
 
 
 @pytest.mark.slow
-def test_a_bag_on_the_ground_without_a_site_shows_its_air_by_its_stars(tmp_path, starcal) -> None:
+def test_a_bag_on_the_ground_without_a_site_shows_its_air_by_its_stars(
+    tiny_products, tmp_path, starcal
+) -> None:
     """A bag in space: its stars contradict the ground, and the sigma holds half of the air."""
-    given = [TINY, '--params', TINY / 'params.yaml', '--set', 'observer=ground']
-    for command in (['diagnose'], ['calibrate', '-o', tmp_path, '--no-report']):
+    observed = tiny_products / 'observations.mcap'
+    given = ['--params', TINY / 'params.yaml', '--set', 'observer=ground']
+    for command in (['diagnose', TINY], ['calibrate', observed, '-o', tmp_path, '--no-report']):
         status, _, notes = starcal(*command, *given)
         assert status == 0 and 'observer: ground: the stars do not show its air' in notes
     calibration = read_calibration(tmp_path / 'calibration.json')

@@ -5,8 +5,6 @@ Facts of FITS headers as cameras, telescopes and programs write them, for calibr
 The headers are written card by card: a library would put right what it is given.
 """
 
-from __future__ import annotations
-
 import calendar
 from collections.abc import Callable, Mapping, Sequence
 import dataclasses

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Image files of every kind that is read, and the ones that are refused in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

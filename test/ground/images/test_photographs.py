@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Facts of photographs by their EXIF tags and FITS headers, written by Pillow and Astropy."""
 
-from __future__ import annotations
-
 import bz2
 import calendar
 from collections.abc import Callable, Mapping
@@ -225,7 +223,6 @@ def read(path: Path) -> Photograph:
 
 
 def imported(path: Path) -> None:
-    """Read the facts and the pixels of a file as an import does."""
     options = ImageOptions({path.name: 1})
     pixels_of(path, options, common_scale([look(path, options)], options))
 

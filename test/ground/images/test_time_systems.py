@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Times of all systems against astropy, which has its own leap seconds and TDB."""
 
-from __future__ import annotations
-
 from offline_time import Time  # type: ignore[import-not-found]
 import pytest
 

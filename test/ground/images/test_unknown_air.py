@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Refraction found by the stars alone, against the chain of ERFA with a known site and clock."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import dataclasses
 import functools

@@ -1,11 +1,12 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The next pointings of a campaign."""
 
-from __future__ import annotations
-
+import csv
 import dataclasses
+import json
 import math
 
+from mission_files import TINY  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from worlds import each_image  # type: ignore[import-not-found]
@@ -181,11 +182,7 @@ def test_the_best_candidate_is_the_one_whose_variance_is_least(ensemble, first) 
 
 
 def test_sigmas_have_the_names_and_units_of_requirements(first) -> None:
-    """
-    An rms has the name of a requirement only if that is on the rms.
-
-    The map has a smaller sigma than lines of sight, which have the alignment.
-    """
+    """The map has a smaller sigma than lines of sight, which have the alignment."""
     covariance = first.posterior.covariance
 
     def planned(name: str, unit: str) -> float:
@@ -217,3 +214,22 @@ def test_expected_noise_is_that_of_stars_of_about_the_magnitude(first) -> None:
     assert (1.0 / expected).sum() == pytest.approx((1.0 / real).sum(), rel=0.05)
     faint_first = expected_noise_px2(first, np.array([9.0, 6.0, 4.0]))
     assert (np.diff(faint_first) < 0).all()
+
+
+@pytest.mark.slow
+def test_the_table_and_the_file_of_the_command_say_the_same(
+    tiny_products, tmp_path, starcal
+) -> None:
+    allowed, output = tmp_path / 'allowed.csv', tmp_path / 'plan.csv'
+    allowed.write_text('ra_deg,dec_deg\n10,40\n100,-20\n200,50\n')
+    observed = [tiny_products / 'observations.mcap', '--params', TINY / 'params.yaml']
+    line = ['plan', *observed, '--pointings', allowed, '--images']
+    shown = starcal(*line, 5, '--minimise', 'map', '-o', output).out.splitlines()
+    with output.open() as file:
+        rows = list(csv.DictReader(file))
+    assert sorted(float(row['ra_deg']) for row in rows) == [10.0, 100.0, 200.0]
+    for step, row in zip(shown[2:], rows, strict=False):
+        assert float(step.split()[-1]) == pytest.approx(float(row['map_rms_arcsec']), rel=1e-3)
+    assert 'no other pointing can be reached after image 3' in shown
+    content = json.loads(starcal(*line, 1, '--json').out)
+    assert content['name'] == 'line_of_sight_rms_arcsec' and len(content['steps']) == 1

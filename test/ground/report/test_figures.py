@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Figures of residuals, of the detector and of the sky: numbers, scales, the projection."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Small pictures: how many are kept, what they show, and that they come back from a folder."""
 
-from __future__ import annotations
-
 import os
 
 import cv2

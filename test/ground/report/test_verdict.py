@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The verdict of a report in words."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

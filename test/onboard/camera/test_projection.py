@@ -25,7 +25,7 @@ from starcal_ros.camera import (
 )
 from starcal_ros.camera.detector_field import (
     basis,
-    basis_products,
+    basis_and_products,
     COSINE_DOMAIN,
     cosine_terms,
     DetectorField,
@@ -399,7 +399,8 @@ def test_products_of_the_cosines_are_those_of_their_values(width, height, octave
     pixels = generator.uniform(-0.5, [width - 0.5, height - 0.5], (500, 2))
     weights = generator.normal(1.0, 1.0, (3, 500))
     phi = basis(pixels, width, height, octaves)
-    products = basis_products(pixels, weights, width, height, octaves)
+    values, products = basis_and_products(pixels, weights, width, height, octaves)
+    np.testing.assert_array_equal(values, phi.T)
     for row, found in zip(weights, products, strict=True):
         np.testing.assert_allclose(found, (phi.T * row) @ phi, rtol=0, atol=1e-10)
 

@@ -28,7 +28,7 @@ from starcal_ros.errors import TooFewObservations
 from starcal_ros.estimation import calibrate
 from starcal_ros.estimation.calibrate import Estimate, estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, check_enough, estimated_parameters
-from starcal_ros.estimation.posterior import is_settled
+from starcal_ros.estimation.posterior import still_to_move
 from starcal_ros.estimation.problem import METHODS
 from starcal_ros.records import CameraGeometry, Ensemble, StarObservations
 from starcal_ros.sky.catalog import load_catalog
@@ -277,9 +277,14 @@ def test_an_estimate_is_settled_where_neither_unknowns_nor_sigmas_move() -> None
     found = estimate_calibration(clean(), PRIOR, EIGHT).posterior
     sigma = np.sqrt(np.diag(found.covariance))
     still = dataclasses.replace(found, mean=0.01 * sigma)
-    assert is_settled(still, found)
-    assert not is_settled(dataclasses.replace(found, mean=0.1 * sigma), found)
-    assert not is_settled(dataclasses.replace(still, working=1.1 * found.working), found)
+    assert still_to_move(still, found, None)[1].max() < 1.0
+    stepping = dataclasses.replace(found, mean=0.1 * sigma)
+    last, left = still_to_move(stepping, found, None)
+    assert left.max() == pytest.approx(2.0)
+    # After changes ten times as large, a ninth of these is to come.
+    assert still_to_move(stepping, found, 10.0 * last)[1].max() == pytest.approx(2.0 / 9.0)
+    wider = dataclasses.replace(still, working=1.1 * found.working)
+    assert still_to_move(wider, found, None)[1].max() > 4.0
 
 
 def test_weights_follow_the_state_that_is_taken() -> None:

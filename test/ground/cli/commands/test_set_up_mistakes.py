@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A mistake of the set-up is named with its remedy by `calibrate` and `diagnose`, and no other."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 import dataclasses
 import json
@@ -10,18 +8,16 @@ from pathlib import Path
 import re
 from typing import Any
 
-from mission_files import params_with, TINY, write_compressed, write_encoded  # type: ignore[import-not-found]
+from mission_files import attitudes, images, params_with, TINY, write_compressed, write_encoded  # type: ignore[import-not-found]
 import numpy as np
 import pytest
 from starcal_tool import assert_refused, Starcal  # type: ignore[import-not-found]
 
 from starcal_ground.bag_writer import BagWriter
-from starcal_ground.bags import reader
 from starcal_ground.mission.ingest.deep_catalog import write_deep_catalog
 from starcal_ground.simulation import simulated_bag
 from starcal_ground.simulation.scenario import scenario
 from starcal_ground.simulation.simulated_bag import ATTITUDE_TOPIC, IMAGE_TOPIC
-from starcal_ros.formats.messages.sensor_messages import attitude_from_message
 from starcal_ros.records import Image
 
 IMAGES = 4
@@ -58,17 +54,13 @@ def _of_pixels(change: Callable[[Any], Any]) -> Write:
     )
 
 
-def bag(path: Path, write: Write, shift_s: float | None = 0.0, cut: int | None = None) -> Path:
-    """Write the tiny bag with images written in another way, and shifted attitudes; None: none."""
-    raws = list(reader.read_raw([TINY], [ATTITUDE_TOPIC])) if shift_s is not None else []
+def bag(path: Path, write: Write, shift_s: float = 0.0, cut: int | None = None) -> Path:
+    """Write the tiny bag with images written in another way, and shifted attitudes."""
     with BagWriter(path) as writer:
-        for raw in raws[:cut]:
-            time_ns, xyzw = attitude_from_message(reader.decode(raw))
-            time_ns += round((shift_s or 0.0) * 1e9)
-            writer.write_attitude(ATTITUDE_TOPIC, time_ns, xyzw, 'icrf')
-        images = reader.read_images([TINY], IMAGE_TOPIC)
-        for _, image in zip(range(IMAGES), images, strict=False):
-            assert isinstance(image, Image)
+        for time_ns, xyzw in attitudes()[:cut]:
+            shifted_ns = time_ns + round(shift_s * 1e9)
+            writer.write_attitude(ATTITUDE_TOPIC, shifted_ns, xyzw, 'icrf')
+        for image in images()[:IMAGES]:
             write(writer, image)
     return path
 
@@ -186,3 +178,37 @@ def test_it_says_that_all_fits_only_of_what_calibrate_accepts(
     if answer.status:
         assert found['cause'] in ('refused', 'not_linear')
         assert found['cause'] != 'refused' or 'but starcal calibrate refuses' in found['sentence']
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ('options', 'cause'),
+    [
+        (['--flip'], 'mirrored'),
+        (['--rotate', '90'], 'rotated'),
+        (['--attitude-direction', 'inertial_to_st'], 'attitude_direction'),
+        (['--quaternion-order', 'wxyz'], 'quaternion_order'),
+        (['--alignment-error', '10'], 'prior_alignment'),
+        (['--focal-error', '20'], 'focal_length'),
+        (['--clock-error', '8'], 'clock'),
+        (['--smear', '12'], 'smear'),
+        (['--gamma', '2.2'], 'not_linear'),
+    ],
+)
+def test_a_simulated_mistake_is_named(options, cause, tmp_path, starcal) -> None:
+    bag = tmp_path / 'bag'
+    made = starcal('simulate', '-o', bag, '--scenario', 'tiny', '--images', 3, *options)
+    assert made.status == 0 and 'truth.json' in made.out and 'params.yaml' in made.out
+    assert json.loads((bag / 'truth.json').read_text())['images'] == 3
+    status, out, _ = starcal('diagnose', bag, '--params', bag / 'params.yaml', '--json')
+    found = json.loads(out)
+    assert (found['cause'], found['also']) == (cause, [])
+    assert status == 3
+
+
+def test_no_simulated_mistake_changes_nothing() -> None:
+    shown: Image = images()[0]
+    same = simulated_bag.NO_MISTAKES.image(shown)
+    assert same.time_ns == shown.time_ns and (same.pixels == shown.pixels).all()
+    late = simulated_bag.Mistakes(clock_error_s=2.5).image(shown)
+    assert late.time_ns - shown.time_ns == 2_500_000_000

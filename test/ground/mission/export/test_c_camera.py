@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The exported C, compiled and run under sanitizers, against the Python package."""
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import math

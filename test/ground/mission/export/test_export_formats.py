@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Exported files, read back by OpenCV, yaml and the published equations of their readers."""
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Callable
 import dataclasses
@@ -26,6 +24,7 @@ from starcal_ground.mission.export import export_formats
 from starcal_ground.mission.export.export_formats import export, Format, FORMATS
 from starcal_ground.mission.export.exported import Content
 from starcal_ground.mission.export.request import Request, SpiceNames
+from starcal_ground.written_files import write_calibration
 from starcal_ros.camera import line_of_sight, pixel_grid, project
 from starcal_ros.errors import OptionError
 from starcal_ros.formats.products.camera_yaml import read_camera_info
@@ -155,7 +154,6 @@ def test_a_reader_sees_stars_as_far_off_as_the_export_states(
 
 
 def test_other_facts_of_a_camera_are_in_the_files_of_their_readers(tmp_path) -> None:
-    """Size, alignment, stated error and change of the focal length, where a format has them."""
     made = calibration(temperature=True)
     quaternion = made.geometry.star_tracker_from_camera_xyzw
     tracker_from_camera = Rotation.from_quat(quaternion)
@@ -325,3 +323,36 @@ def test_an_exported_camera_is_read_as_a_prior_camera(tmp_path, form, model) -> 
     camera = read_camera_info(tmp_path / next(iter(made.files)))
     pixels, directions = grid_of(calibration(model, 0.0, False))
     assert worst_px(project(camera, directions), pixels) < made.worst_px + 1e-6
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / 'out').mkdir()
+    write_calibration(calibration(), tmp_path / 'out/calibration.json')
+    return tmp_path / 'out'
+
+
+def test_the_command_writes_kernels_that_load(folder, tmp_path, starcal) -> None:
+    kernels = tmp_path / 'deep/kernels'
+    names = ['--spacecraft-id', -999, '--star-tracker-id', -999100]
+    out = starcal('export', folder, '--to', 'spice', '-o', kernels, *names).out
+    assert 'largest error of a pixel against the calibration: 0 px' in out
+    spiceypy.kclear()
+    for path in kernels.iterdir():
+        spiceypy.furnsh(str(path))
+    assert spiceypy.pxform('CAMERA_OPTICAL_FRAME', 'STAR_TRACKER', 0.0).shape == (3, 3)
+    spiceypy.kclear()
+
+
+@pytest.mark.parametrize('accepted', [True, False])
+def test_the_command_states_the_cost_of_each_part_and_a_refusal_by_the_gate(
+    folder, tmp_path, starcal, accepted
+) -> None:
+    reasons = () if accepted else ('error of the map 2 px, limit 0.1 px',)
+    judged = dataclasses.replace(calibration(), accepted=accepted, reasons=reasons)
+    write_calibration(judged, folder / 'calibration.json')
+    answer = starcal('export', folder, '--to', 'opencv', '-o', tmp_path)
+    expected = [f'starcal: warning: the gate refused this calibration: {one}' for one in reasons]
+    assert (answer.status, answer.err.splitlines()) == (0, expected)
+    lines = answer.out.splitlines()
+    assert lines[1].startswith('largest error') and lines[2].startswith('left out: skew, 0.')

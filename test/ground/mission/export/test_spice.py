@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """SPICE kernels, read back by spiceypy: lines of sight and attitudes of the camera."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

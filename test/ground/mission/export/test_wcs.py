@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Astropy's reading of the headers against catalog places that Astropy moves to the date."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

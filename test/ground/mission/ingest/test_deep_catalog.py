@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Catalogs from tables as their sources write them, written by astropy."""
 
-from __future__ import annotations
-
 from collections import Counter
 import dataclasses
 from pathlib import Path

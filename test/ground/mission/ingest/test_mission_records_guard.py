@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Files that would take gigabytes, minutes or the process end their reader, in one line each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import gzip
 import os

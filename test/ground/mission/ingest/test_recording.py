@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """From FITS and an attitude ephemeris to the calibration of the original bag."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import hashlib
 import json

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attitudes and velocities from CCSDS, SPICE and tables, each written by its own library."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mission_files import (  # type: ignore[import-not-found]

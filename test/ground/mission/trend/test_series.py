@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Series, activations and changes of calibrations whose differences are known."""
 
-from __future__ import annotations
-
 from export_calibrations import calibration  # type: ignore[import-not-found]
 import numpy as np
 import pytest

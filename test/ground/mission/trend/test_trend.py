@@ -1,11 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The command over a folder tree or a URL: rows, increments, workers, poison and versions.
-
-Then cameras and parameters from a pattern, and the example for Kubernetes in the documents.
-"""
-
-from __future__ import annotations
+"""A trend of a folder tree or a URL: rows, increments, workers, poison, versions and cameras."""
 
 from collections.abc import Callable, Iterator
 import contextlib
@@ -173,7 +167,7 @@ def test_a_bag_that_kills_its_worker_costs_itself(mission, monkeypatch) -> None:
     found = [Task('poison', 'poison'), *fleet.find(str(mission), Cameras())]
     monkeypatch.setattr(fleet, 'compute', kill_on_poison)
     table = Table(mission.parent)
-    assert fleet.update(table, found, workers=2) == fleet.Done(computed=8, failed=1)
+    assert fleet.update(table, found, workers=1) == fleet.Done(computed=8, failed=1)
     errors = [row.error for row in Table(mission.parent).rows() if row.error]
     assert errors == ['ends its worker process, also alone: out of memory?']
 
@@ -277,15 +271,9 @@ def test_two_spacecraft_with_equal_lenses_are_two_series(tmp_path, trend) -> Non
     assert re.findall('<h2>([AB])', page) == ['A', 'B']
 
 
-_DOCUMENT = (Path(__file__).parents[4] / 'docs/mission_trend.md').read_text()
+_DOCUMENT = Path(__file__).parents[4] / 'docs/mission_trend.md'
 _PLACE = Path(sys.executable).parent
 _START_S = 240.0
-
-
-def example(language: str, word: str) -> str:
-    fences = re.findall(rf'```{language}\n(.*?)```', _DOCUMENT, re.DOTALL)
-    (found,) = (text for text in fences if word in text)
-    return str(found)
 
 
 @contextlib.contextmanager
@@ -312,7 +300,8 @@ def container(
 def test_the_containers_of_kubernetes_find_each_other() -> None:
     from distributed import Client  # its import takes a second
 
-    cluster = yaml.safe_load(example('yaml', 'DaskCluster'))
+    fences = re.findall(r'```yaml\n(.*?)```', _DOCUMENT.read_text(), re.DOTALL)
+    (cluster,) = (yaml.safe_load(text) for text in fences if 'DaskCluster' in text)
     with socket.create_server(('127.0.0.1', 0)) as free:
         port = free.getsockname()[1]
     address, name = f'tcp://127.0.0.1:{port}', 'starcal-default-worker-1'

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The table grows, survives a kill at any instant and holds each row once."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import gc
 import math
