@@ -80,6 +80,8 @@ class Stamps:
         Mask of the pixels to leave out: saturated, hot, outside the image.
     streak_px : (n, 2), optional
         Path of each star during the exposure; None: sharp stars.
+    uneven : (n,), optional
+        Mask of the stars whose background has a slope; None: all have a level alone.
     """
 
     data_dn: Floats
@@ -87,6 +89,7 @@ class Stamps:
     noise2_dn2: Floats
     out: Mask | None = None
     streak_px: Floats | None = None
+    uneven: Mask | None = None
 
     def __len__(self) -> int:
         """Return the number of stars."""
@@ -208,6 +211,7 @@ def fit_at(stamps: Stamps, parameters: Floats, pixel_noise: PixelNoise) -> PsfFi
     spoilt, pixel = _single_misfits(residual, light, parameters, stamps)
     if len(spoilt):
         root_weight[spoilt, pixel], rows[spoilt, :, pixel] = 0.0, 0.0
+        rows[spoilt] = _less_slopes(rows[spoilt], root_weight[spoilt], stamps.select(spoilt))
         normal[spoilt], gradient[spoilt] = _normal(rows[spoilt], parameters[spoilt])
         covariance[spoilt] = np.linalg.inv(normal[spoilt, :4, :4])
         last[spoilt] = (covariance[spoilt] @ gradient[spoilt, :4, None])[:, :, 0]
@@ -490,7 +494,21 @@ def _whitened_rows(
     valid = stamps.valid
     np.divide(1.0 if valid is None else valid, root_weight, out=root_weight)
     rows *= root_weight[:, None, :]
-    return rows, light, root_weight
+    return _less_slopes(rows, root_weight, stamps), light, root_weight
+
+
+def _less_slopes(rows: Floats, root_weight: Floats, stamps: Stamps) -> Floats:
+    """Whitened rows (n, k, p), those of uneven stars at right angles to slopes: both are free."""
+    if stamps.uneven is None:
+        return rows
+    star = np.flatnonzero(stamps.uneven)
+    places = np.indices((stamps.width, stamps.width)).reshape(2, -1) - stamps.width // 2
+    slopes = places * root_weight[star, None]
+    across = slopes.transpose(0, 2, 1)
+    # The addition keeps a window without pixels solvable.
+    parts = np.linalg.solve(slopes @ across + 1e-12 * np.eye(2), slopes)
+    rows[star] -= (rows[star] @ across) @ parts
+    return rows
 
 
 def _normal(rows: Floats, parameters: Floats) -> tuple[Floats, Floats]:
