@@ -5,8 +5,6 @@ Hostile values for the tests of files from outside, and the files that they chan
 ``STARCAL_ATTACKS=100`` in the environment draws a hundred times as many cases as the default.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import functools
 import hashlib

@@ -6,8 +6,6 @@ The dense matrices come from finite differences of pixels and star-tracker error
 all unknowns, written here from their definitions.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass

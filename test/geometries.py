@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Cameras that are turned against their mounting, by how much two are, and their lenses."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from scipy.spatial.transform import Rotation

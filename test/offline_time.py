@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Times of astropy that fetch no leap seconds, as they do where its own are of last year."""
 
-from __future__ import annotations
-
 from astropy.time import Time
 from astropy.utils import iers
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Records with a different number in every field, and exact comparison of records."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from types import SimpleNamespace

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Images of a simulated campaign, where their stars are, planets; a detector without defects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 import dataclasses
 import functools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Small simulated campaign used by several tests."""
 
-from __future__ import annotations
-
 import functools
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Campaigns with a known truth, their estimates, and errors in the metric of the covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 import contextlib
 import dataclasses

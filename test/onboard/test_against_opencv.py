@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every camera model against OpenCV, which has no skew; skew against the paper's formula."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The one line that names a missing package."""
 
-from __future__ import annotations
-
 import sys
 
 import pytest

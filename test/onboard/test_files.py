@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The one way to write a file."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Options: types, limits, error messages, YAML files."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 import math

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """One BLAS thread where starcal computes, and freed memory returned to the system."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 import ctypes
 import os

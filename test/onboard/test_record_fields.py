@@ -7,8 +7,6 @@ The values are drawn from the descriptions of the fields; that these are right i
 each door, by values that are written out.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 import dataclasses
 from dataclasses import dataclass

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Text of unknown origin made safe to print, and numbers as a reader sees them."""
 
-from __future__ import annotations
-
 import math
 
 import pytest

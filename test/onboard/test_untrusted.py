@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The door of untrusted text: plain values, and what is refused with its line."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

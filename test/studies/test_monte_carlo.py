@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Monte Carlo studies: the same from any number of workers, and true to what is known."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The paper's night: frames as any image, judging by images not seen, the page."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import json

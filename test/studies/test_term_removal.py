@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The removal of terms, against calibrations that never had them and against chance."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

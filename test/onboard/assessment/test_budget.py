@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Budget of the sigma of lines of sight: against estimates with an assumption switched off."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The gate: every limit trips by itself, with its own reason, and nothing that is NaN passes."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 from typing import Any

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Lines of sight by pixel: against the camera, against differences, and in every format."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

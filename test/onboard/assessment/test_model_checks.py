@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Contradictions of priors, departures from the model and lost lines, each with its number."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from typing import Any

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """What an ensemble can tell, against the solve itself, brute force and Monte Carlo."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Predictions of images, stars and cells by the others, and the residuals that are left."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 import functools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Requirements: what is understood, the sigma each limits, and the answer; remedies."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 import re

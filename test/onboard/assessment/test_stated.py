@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Statements of an ensemble that are wrong, each with what is said; no star is needed for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 import math

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Every camera model: derivatives, inverse, fold, fits; the field of a detector."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The usual four images and their dense problem, for the tests of a session."""
 
-from __future__ import annotations
-
 from four_images import Dense, Small, usual  # type: ignore[import-not-found]
 import pytest
 

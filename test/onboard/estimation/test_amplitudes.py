@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Amplitudes: restricted likelihoods against dense ones of error contrasts, and simulations."""
 
-from __future__ import annotations
-
 import dataclasses
 from dataclasses import dataclass
 import math

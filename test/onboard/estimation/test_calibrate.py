@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibrations of observations whose truth is known: exact, unbiased, and true to their sigma."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ The arrow of normal equations is that of the dense problem of four images.
 So is the derivative of each unknown: of pixels by an independent projection, and of attitudes.
 """
 
-from __future__ import annotations
-
 import dataclasses
 
 from four_images import Dense, dense, IMAGES, OWN, prior_precision, SHAPE, Small  # type: ignore[import-not-found]

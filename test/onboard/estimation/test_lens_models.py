@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Calibration with every lens model: exact without noise, within the reported covariance with."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from geometries import COEFFICIENTS, turned  # type: ignore[import-not-found]

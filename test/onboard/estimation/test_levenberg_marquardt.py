@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The solver against dense algebra and SciPy, on problems without cameras."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 

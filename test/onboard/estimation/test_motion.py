@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Unknowns of a moving camera: velocity of the observer, time of read-out, offset of stamps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import dataclasses
 import math

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Outliers: bad observations, stars and images are left out, sound ones are not."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The posterior is the dense least-squares solution with priors, exactly."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

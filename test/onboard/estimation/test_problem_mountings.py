@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Several star trackers: the camera aligned to each, with a true covariance."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 import dataclasses
 import math

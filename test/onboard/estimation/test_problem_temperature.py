@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Temperature terms: recovery, errors within sigma, and terms that are none."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The search against the dense problem of four images: state, cost and covariance at its end."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from four_images import dense, IMAGES, OWN, prior_offset, prior_precision, SHAPE, small, solution  # type: ignore[import-not-found]

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Errors that observations share: unbiased variances, integrals, and sums by brute force."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

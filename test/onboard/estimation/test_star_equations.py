@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Normal matrices, gradient and cost against the dense Jacobian."""
 
-from __future__ import annotations
-
 import dataclasses
 
 from geometries import COEFFICIENTS  # type: ignore[import-not-found]

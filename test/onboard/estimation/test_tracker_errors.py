@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Errors of a star tracker: dense restricted likelihoods, and the mean's sigma in simulations."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

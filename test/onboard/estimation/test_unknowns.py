@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The list of unknowns: which there are, what a step moves, and a row that adds one."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 

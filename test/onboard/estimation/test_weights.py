@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Weights from residuals: planted centroid variances, leverage, and residuals of no star."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from four_images import CAMERA, IMAGES, usual  # type: ignore[import-not-found]

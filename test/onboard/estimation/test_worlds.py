@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The estimator in simulated worlds: exact, true to its sigma, and robust."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

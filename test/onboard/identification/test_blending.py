@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Pull of neighbours on centroids: against fits, and of stars below the magnitude limit."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math

@@ -5,8 +5,6 @@ Brightnesses and lost lines expose false matches and do not affect true ones.
 Frames with lost lines are refused, those with a wrong prior are not.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import re

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Predicted stars against the simulated scene, and the polynomial correction of predictions."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Identification of simulated images: right stars or none, with wrong alignment or attitude."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Stars of narrow fields, from 5 an image, with the uncertainty of the attitude that is stated."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

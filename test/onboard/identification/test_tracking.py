@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Tracking: the same stars as a search, or a lost track; streaks are measured at their middle."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import itertools

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Pictures: of the image's size, with stars where they are, whatever the image holds."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A sequence of images: what is measured, what is refused, and where it stands after."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 from pathlib import Path

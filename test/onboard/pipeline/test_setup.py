@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The setup: what it holds of the parameters and frames of the detector, and what it refuses."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -5,8 +5,6 @@ From an ensemble to a calibration: statistics, verdict, provenance; what cannot 
 The lens model that is chosen is the smallest that describes the stars.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import json

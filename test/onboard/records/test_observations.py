@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Codes of star refusals and their names; covariance of a field as factor and remainder."""
 
-from __future__ import annotations
-
 import dataclasses
 
 import numpy as np

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Apparent directions, refraction and time scales against astropy and the full ERFA chain."""
 
-from __future__ import annotations
-
 from astropy import units as u
 from astropy.coordinates import AltAz, Distance, EarthLocation, GCRS, ICRS, SkyCoord
 import erfa

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Apparent directions against special relativity and approximations; time scales; bad calls."""
 
-from __future__ import annotations
-
 import dataclasses
 import datetime
 import math

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Attitude samples: validation, order, interpolation, refusals."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from typing import Any

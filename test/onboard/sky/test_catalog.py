@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The bundled catalog against the literature and itself; searches against brute force."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """A velocity against that of the Earth: usual mistakes are named, right velocities are not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import erfa

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames that are no textbook: cut off at black, masked, undersampled, sloping, of faint stars."""
 
-from __future__ import annotations
-
 import dataclasses
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Centroids of rendered stars: the Cramer-Rao bound, true covariances, no bias, good refusals."""
 
-from __future__ import annotations
-
 from collections import Counter
 import dataclasses
 import math

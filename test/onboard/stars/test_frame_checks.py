@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Frames that are unfit as a whole are refused by name; sound ones of any kind are not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 import functools
 from typing import Any

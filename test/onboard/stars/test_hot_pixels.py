@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Hot pixels are learnt from the images, known from a dark frame, and never measured as stars."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Light along a path, and the place of a star over an exposure."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

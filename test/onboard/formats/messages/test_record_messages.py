@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages of observations, calibration and status: round trips, and what is refused."""
 
-from __future__ import annotations
-
 import dataclasses
 import functools
 import math

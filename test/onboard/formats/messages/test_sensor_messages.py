@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Messages of images and of what comes beside them: layouts, refusals, round trips, stamps."""
 
-from __future__ import annotations
-
 import array
 import functools
 import itertools

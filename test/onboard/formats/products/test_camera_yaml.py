@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """File camera_info.yaml: round trips, hand-written files, errors, URLs."""
 
-from __future__ import annotations
-
 import itertools
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """File calibration.json: round trips, damaged files, errors."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import math
