@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Hostile values for the tests of files from outside, and the files that they change.
-
-``STARCAL_ATTACKS=100`` in the environment draws a hundred times as many cases as the default.
-"""
+"""Hostile values for files from outside; ``STARCAL_ATTACKS=100`` draws a hundred times as many."""
 
 from collections.abc import Callable, Iterator
 import functools

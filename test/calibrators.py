@@ -179,11 +179,7 @@ def kept(state: CalibratorState) -> tuple[str, str]:
 
 
 def scripts(text: str) -> dict[str, tuple[str, ...]]:
-    """
-    Cases by name: their steps, which stand below it, and what is expected, apart by bars.
-
-    ``none`` stands for an empty text; lines with ``#`` are comments.
-    """
+    """Cases by name, with steps and expected texts; ``none`` is an empty one, ``#`` a comment."""
     cases: dict[str, tuple[str, ...]] = {}
     name = ''
     for line in text.strip().splitlines():

@@ -111,11 +111,7 @@ MadeOnce = Callable[[str, Callable[[Path], object]], Path]
 
 @pytest.fixture(scope='session')
 def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
-    """
-    Folders by name, each filled by the first worker of a run that needs it.
-
-    Tests must not change them.
-    """
+    """Folders by name, filled by the first worker that needs one; tests must not change them."""
     base = tmp_path_factory.getbasetemp()
     if 'PYTEST_XDIST_WORKER' in os.environ:
         base = base.parent  # of all workers
@@ -181,11 +177,7 @@ def has_failed(request: pytest.FixtureRequest) -> Callable[[], bool]:
 def start_node(
     ros_domain: None, tmp_path: Path, has_failed: Callable[[], bool]
 ) -> Iterator[StartNode]:
-    """
-    Start node processes by module name; they are stopped at the end of the test.
-
-    Not ``forked``, they start and end with an interpreter of their own.
-    """
+    """Start nodes by module name, stopped after the test; ``forked=False``: own interpreters."""
     started: list[NodeProcess] = []
 
     def start(name: str, *ros: str, forked: bool = True) -> NodeProcess:
@@ -244,11 +236,7 @@ def tiny_bag(made_once: MadeOnce) -> Path:
 
 @pytest.fixture(scope='session')
 def few_images(made_once: MadeOnce) -> Path:
-    """
-    The same bag as it is after three images, which half of the time calibrates.
-
-    For tests of what becomes of bags and of calibrations, not of what is in them.
-    """
+    """The first three images of that bag: faster, for tests that do not depend on its content."""
 
     def write(folder: Path) -> None:
         from starcal_ground.simulation import scenario, simulated_bag

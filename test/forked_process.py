@@ -27,11 +27,7 @@ FORKSERVER.set_forkserver_preload(
 
 
 class ForkedProcess:
-    """
-    A process forked from one that has imported all that is needed.
-
-    That one has no threads and no part in ROS.  The methods are those of `subprocess.Popen`.
-    """
+    """A process like `subprocess.Popen`, forked from one with all imports, no threads, no ROS."""
 
     def __init__(self, target: Any, *arguments: object) -> None:
         self._process = FORKSERVER.Process(target=target, args=arguments, daemon=True)

@@ -338,11 +338,7 @@ def whitener(covariance_px2: Floats) -> Floats:
 
 
 def prior_precision(given: Small, shape_px: Floats, field_px: Floats | None) -> Floats:
-    """
-    Return the prior's precision (P + 11 m,) of all unknowns; infinite: held.
-
-    ``field_px`` (3,) are the amplitudes of the octaves; None: no field.
-    """
+    """Prior precision (P + 11 m,), infinite if held; ``field_px`` (3,) by octave, None: held."""
     parts = []
     problem = given.problem
     for entry in given.layout.shared:
@@ -391,11 +387,7 @@ def prior_offset(given: Small) -> Floats:
 
 
 def solution(problem: Dense, precision: Floats, offset: Floats) -> tuple[Floats, Floats, float]:
-    """
-    Mean, covariance and log evidence of all unknowns; held ones are zero.
-
-    The evidence is that of the priors that are proper, up to a constant.
-    """
+    """Mean, covariance (zero if held), log evidence of the proper priors up to a constant."""
     free = np.isfinite(precision)
     X = np.concatenate([problem.stars, problem.trackers])[:, free]
     r = np.concatenate([problem.residual, -problem.error])

@@ -94,12 +94,7 @@ class RosTools:
     def run(
         self, *arguments: str | Path, timeout_s: float = RUN_S
     ) -> subprocess.CompletedProcess[str]:
-        """
-        Run `ros2` with these arguments to its end.
-
-        The tool looks for a node once, half a second after its start: on busy cores discovery
-        takes longer.  It runs again where it did not find the node, and so did nothing.
-        """
+        """Run `ros2` to its end, again if it found no node: it looks once, after half a second."""
         deadline_s = time.monotonic() + RUN_S
         while True:
             done: subprocess.CompletedProcess[str] = run(

@@ -167,12 +167,7 @@ class Client:
         again_s: float = 40.0,
         **fields: Any,
     ) -> Any:
-        """
-        Call a service; without an answer after some time, call it once more.
-
-        A node may receive a request before discovery of the client; then its answer is lost.  The
-        client stays: once it has had an answer, that of a later call is not lost.
-        """
+        """Call by a client that stays, again if unanswered: discovery may lose an answer."""
         if name not in self._services:
             self._services[name] = self.node.create_client(kind, name)
         self.until(self._services[name].service_is_ready, timeout_s)
@@ -215,11 +210,7 @@ class Client:
         return publisher
 
     def until_listened(self, name: str = 'star_observer', listeners: int = 1) -> None:
-        """
-        Wait until an observer reports that its observations have subscribers.
-
-        Discovery is not symmetric, and messages of a volatile publisher before the match are lost.
-        """
+        """Wait for subscribers: discovery is not symmetric, and earlier messages are lost."""
         self.until(lambda: int(self.health(name)[2].get('listeners', 0)) >= listeners)
 
     def health(self, name: str = 'star_observer') -> tuple[bytes, str, dict[str, str]]:

@@ -120,11 +120,7 @@ def estimate_of(made: Campaign, **options: object) -> Estimate:
 
 
 def solved(world: World, seed: int, **options: object) -> Estimate:
-    """
-    Return the estimate of a world, which is made once for all tests and workers.
-
-    It is kept on disk until a source changes that it depends on.  Tests must not change it.
-    """
+    """Estimate of a world, made once for all workers until a source changes; not to be changed."""
     key = hashlib.sha256(pickle.dumps((world, seed, sorted(options.items())))).hexdigest()[:16]
     path = _folder_of_these_sources() / key
     with _locked(path.with_suffix('.lock')):
@@ -138,11 +134,7 @@ def solved(world: World, seed: int, **options: object) -> Estimate:
 
 @functools.cache
 def _folder_of_these_sources() -> Path:
-    """
-    Return the folder of estimates by the sources as they are.
-
-    One other folder stays, which a run that began with other sources may still use.
-    """
+    """Folder of estimates by the sources; one other stays for a run that began before an edit."""
     digest = hashlib.sha256(f'{sys.version} {np.__version__} {scipy.__version__}'.encode())
     for folder in ('starcal_ros', 'starcal_ground/simulation', 'studies'):
         for path in sorted((ROOT / folder).rglob('*.py')):

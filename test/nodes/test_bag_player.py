@@ -147,11 +147,7 @@ def test_messages_of_another_version_are_played_as_those_of_this_one(vehicle, tm
 
 
 def test_a_shutdown_that_wakes_nothing_ends_the_player() -> None:
-    """
-    An executor may wait again between the two steps by which rclpy answers a signal.
-
-    It wakes the executors, then shuts ROS down; here only the second step comes.
-    """
+    """A signal wakes executors, then shuts down ROS: one that waits between sees only the last."""
     context = Context()
     context.init()
     executor = SingleThreadedExecutor(context=context)

@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Test of an integrator: only generated interfaces and the names of the ICD.
-
-Nothing here imports starcal_ros; the images come from a bag through rosbags.
-"""
+"""An integrator's client: generated interfaces and names of the ICD, no import of starcal_ros."""
 
 import array
 from collections.abc import Iterator

@@ -222,12 +222,7 @@ def grown(
 
 
 def test_any_histories_are_joined() -> None:
-    """
-    Of three places with common and different events, in any order and joined again.
-
-    Each event is there once, in order, a number names one calibration, and no file of the folder
-    changes under the same event.
-    """
+    """Each event is there once, in order; a number names one calibration, an event one file."""
     for seed in range(300):
         random, clock = Random(seed), [0]
         common = grown((), random, clock)

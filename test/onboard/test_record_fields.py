@@ -2,9 +2,8 @@
 """
 Records to JSON and back by the types of their fields: a new field needs no other edit.
 
-Then each door with wrong values in each of its fields, refused in one line that names the field.
-The values are drawn from the descriptions of the fields; that these are right is tested beside
-each door, by values that are written out.
+Then wrong values of each field at each door, drawn from the descriptions of the fields; that
+these are right is tested beside each door, by values that are written out.
 """
 
 from collections.abc import Iterator, Mapping

@@ -164,11 +164,7 @@ def test_per_image_beats_single_where_the_star_tracker_is_bad() -> None:
 
 
 def test_hierarchical_gains_where_stars_are_few_and_the_star_tracker_good() -> None:
-    """
-    Eight stars place an image to some 4 arcsec: a star tracker of 1 arcsec knows better.
-
-    The reported sigmas show it in each trial; that they are true is the test below.
-    """
+    """Stars place an image to 4 arcsec, the tracker to 1; that sigmas are true: the test below."""
     methods = ('per_image', 'hierarchical')
     found = here(Design('table1', 3, (16,), (8,), tracker_arcsec=(1.0,), methods=methods))
     for per_image, hierarchical in zip(found.rows[::2], found.rows[1::2], strict=True):

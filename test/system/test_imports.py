@@ -60,12 +60,7 @@ def imported_by(name: str, in_functions: bool = True) -> set[str]:
 
 
 def needed_by(name: str) -> set[str]:
-    """
-    Modules and packages that the import of a module needs whole.
-
-    The packages of an imported module are run before it, but those that the importing module is
-    in are running already.
-    """
+    """Modules and packages run by an import, without those that the importing module is in."""
     found = imported_by(name, in_functions=False)
     for parts in [imported.split('.') for imported in found]:
         outer = {'.'.join(parts[:k]) for k in range(1, len(parts))}

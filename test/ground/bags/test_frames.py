@@ -98,11 +98,7 @@ def test_attitudes_in_a_file_of_their_own_are_found(tmp_path, monkeypatch) -> No
 
 @pytest.mark.parametrize(('hole', 'beside'), [((22, 48), 1), ((-10, 12), 0), ((75, 120), 0)])
 def test_a_gap_filled_at_the_end_of_the_recording(tmp_path, hole, beside) -> None:
-    """
-    A spacecraft sends what was lost after everything else; the gap is over 2 s long.
-
-    The rate of an image that has both samples, just before the gap, is of fewer: it is reported.
-    """
+    """Samples of over 2 s come last; the image just before them has a rate of fewer: reported."""
     low, high = hole
     late = [item for item in recording() if item[0] == 'attitude' and low < item[1] < high]
     rest = [item for item in recording() if item not in late]

@@ -261,11 +261,7 @@ def test_a_flipped_bit_loses_one_chunk_only(tmp_path, small_chunks) -> None:
 @settings(max_examples=250)
 @given(data=st.data())
 def test_damage_is_always_reported(small_chunks, data) -> None:
-    """
-    With any flipped bits, random bytes and truncation, messages read are those written.
-
-    Losses are reported, each in one line; with an intact summary their count is exact.
-    """
+    """Messages read are those written; each loss is one line, exact if the summary is intact."""
     whole = small_chunks.read_bytes()
     sound = list(bag_reader.read_raw([small_chunks]))
     with small_chunks.open('rb') as stream:

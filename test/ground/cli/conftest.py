@@ -15,11 +15,7 @@ from starcal_ros.sky.catalog import load_catalog
 
 @pytest.fixture(scope='session')
 def campaign(made_once: Callable[..., Path], few_images: Path) -> Path:
-    """
-    A bag, products in ``out/``, a frame to import, kernels, a table of Gaia, and pointings.
-
-    Tests must not change it.
-    """
+    """Bag, products in ``out/``, frames, kernels, Gaia stars, pointings; tests change nothing."""
 
     def write(folder: Path) -> None:
         shutil.copytree(few_images, folder / 'bag')

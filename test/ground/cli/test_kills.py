@@ -2,9 +2,8 @@
 """
 Kills and interrupts of each sub-command: inputs unchanged, outputs whole, old or absent.
 
-A kill at random seldom meets a write.  So the output folder is looked at just before each
-operation of a run on a file in it: a SIGKILL at that instant would leave this.  Other runs are
-interrupted there.
+A kill at random seldom meets a write: the output folder is looked at just before each operation on
+a file in it, as a SIGKILL at that instant would leave it.  Other runs are interrupted there.
 """
 
 from collections.abc import Callable, Iterator, Mapping

@@ -54,11 +54,7 @@ def night_of(scenario: synthetic.Scenario, stamps_ns: Any, sent: Any) -> Night:
 
 @functools.cache
 def slewing_night(images: int = 3) -> Night:
-    """
-    Up to four images, 20 s apart; the spacecraft slews 1 to 3 degrees a second about no one axis.
-
-    The attitude is reported each half second for 100 s before and after, without noise.
-    """
+    """Up to four images, 20 s apart, that slew 1 to 3 deg/s about no one axis; exact attitudes."""
     rng = np.random.default_rng(7)
     step_s, around_s, count = 20.0, 100.0, 4
     knots_s = np.arange(-around_s - step_s, (count - 1) * step_s + around_s + 2 * step_s, step_s)

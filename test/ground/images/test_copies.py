@@ -33,12 +33,7 @@ def sky(seed: int, psf_px: float = 1.0, faint: int = 0) -> Floats:
 def exposed(
     light: Floats, seed: int, shift_px: float = 0.0, pattern: float = 0.0, hot: float = 0.002
 ) -> Pixels:
-    """
-    An exposure of 16 bit.
-
-    Its pointing is off by a shift; the detector has a pattern, its variance in that of the noise,
-    and a part of hot pixels, both the same in all exposures.
-    """
+    """A shifted 16-bit exposure; pattern, in variances of the noise, and hot pixels are fixed."""
     rng, fixed = np.random.default_rng([seed, 1]), np.random.default_rng(0)
     moved = rng.normal(0.0, max(shift_px, 1e-9), 2)
     seen = np.fft.ifft2(fourier_shift(np.fft.fft2(light), moved)).real.clip(0)

@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Facts of FITS headers as cameras, telescopes and programs write them, for calibrate and import.
-
-The headers are written card by card: a library would put right what it is given.
-"""
+"""FITS headers of cameras and programs, card by card: a library would correct what is given."""
 
 import calendar
 from collections.abc import Callable, Mapping, Sequence

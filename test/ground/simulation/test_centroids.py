@@ -53,11 +53,7 @@ def test_observations_have_the_noise_they_report() -> None:
 
 @pytest.mark.parametrize(('electrons', 'phase'), [(300.0, 0.0), (3000.0, 0.5), (30000.0, 0.23)])
 def test_the_bound_is_the_scatter_of_fits_to_noisy_stars(electrons, phase) -> None:
-    """
-    Scatter of weighted least-squares steps from the truth, over many images of one star.
-
-    The step is efficient, so its scatter equals the bound if derivatives and noise are right.
-    """
+    """Least-squares steps are efficient: they scatter by it if derivatives and noise are right."""
     side, count = 13, 3000
     place = np.array([[6.0 + phase, 6.0 - phase]])
     flux = np.array([electrons])

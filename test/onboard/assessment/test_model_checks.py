@@ -52,11 +52,7 @@ def with_cx_off(off_px: float) -> tuple[Scenario, Ensemble]:
 
 
 def test_a_sound_camera_contradicts_nothing_and_has_no_step() -> None:
-    """
-    Four campaigns: no held term beyond 4.5 sigma, no likelihood ratio of a 1e-5 level.
-
-    The least of the p-values of their steps is under 1e-3 in 1 of 250 runs.
-    """
+    """Four campaigns: a ratio of 20 is a 1e-5 level, the least p-value under 1e-3 in 1 of 250."""
     for seed in range(1, 5):
         checks = model_checks(estimated(*observed(seed, images=6)))
         assert {'cx', 'cy'} <= {term.name for term in checks.held}
@@ -185,11 +181,7 @@ def test_a_focal_length_that_breathes_is_estimated_image_by_image() -> None:
 
 @pytest.mark.parametrize('sigma_m_s', [20e3, 10.0], ids=['not given', 'given'])
 def test_a_lens_that_warms_is_no_velocity(sigma_m_s: float) -> None:
-    """
-    Images one degree apart, of a focal length that grows by 6e-5 rms: 0.08 px in the last corner.
-
-    Without a trend the velocity was 62 of its sigma off, and one given right was 12 sigma wrong.
-    """
+    """0.08 px in the corner: without a trend the velocity was 62 sigma off, a given one 12."""
     made = worlds.simulate(worlds.World(48, 'strip', tracker_arcsec=2.0), 1)
     scales = 6e-5 * np.sqrt(3.0) * np.linspace(-1.0, 1.0, 48)  # a ramp of unit rms
     made = dataclasses.replace(made, ensemble=breathing(made.ensemble, scales))
@@ -220,11 +212,7 @@ def test_a_velocity_that_stars_show_to_no_possible_size_is_not_tested() -> None:
 
 @pytest.mark.slow
 def test_a_velocity_that_takes_the_place_of_a_tilt_is_no_contradiction() -> None:
-    """
-    A fisheye that looks one way has no term of a tilt, which a velocity and the field share.
-
-    A field that was flat nearer to the border left 6.8 sigma to the velocity.
-    """
+    """A fisheye that looks one way has no tilt term; a field flat at the border left 6.8 sigma."""
     tilted = functools.partial(worlds.tilt, 0.1)
     lens: dict[str, Any] = {'model': 'equidistant', 'field_deg': 90.0, 'corner': -0.02}
     stars: dict[str, Any] = {'magnitude_limit': 5.3, 'zero_point_dn': 8e5, 'bright_px': 0.03}

@@ -181,12 +181,7 @@ def of_images(bins: list[ResidualBin]) -> list[ResidualBin]:
 
 
 def test_few_images_of_a_lens_with_structure_are_predicted() -> None:
-    """
-    Five images, 0.15 px of a wave of a fourteenth of the width.
-
-    Less an image, the information of the average over the amplitudes is nearly singular.  At the
-    most likely ones an image with a shape of its own still stands apart.
-    """
+    """Less an image, information is nearly singular in the mean over amplitudes, not at the mode."""
     given, ensemble = observed(21, images=5)
 
     def move(pixels: Floats) -> Floats:
@@ -237,11 +232,7 @@ def test_an_image_is_predicted_where_stars_come_again() -> None:
 
 
 def test_places_of_stars_that_the_model_has_are_no_fault() -> None:
-    """
-    Catalog places off by 0.3 arcsec, the same in all images: their variance is estimated.
-
-    Without it the sums over the images of a star are larger than their noise.
-    """
+    """Off by 0.3 arcsec in all images; without that variance sums of a star exceed the noise."""
     found = estimated(*of_three_fields())
     bins = [one for one in predictions(found) if one.by == 'star']
     assert bins and max(one.normalised for one in bins) < 1.15

@@ -144,11 +144,7 @@ def test_the_order_of_the_names_does_not_matter() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize('method', TRIALS)
 def test_the_reported_covariance_is_true(method: str) -> None:
-    """
-    That of all, and those of the camera and of the alignment alone.
-
-    Centroid covariances that are stated wrong by four do no harm: their scale is estimated.
-    """
+    """For all, the camera and the alignment; centroid covariances wrong by four are rescaled."""
     estimates = trials(method)
     assert {e.termination for e in estimates} == {'converged'}
     for rows in (ESTIMATED, FREE, [10, 11, 12]):

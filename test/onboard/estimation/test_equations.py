@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-The arrow of normal equations is that of the dense problem of four images.
-
-So is the derivative of each unknown: of pixels by an independent projection, and of attitudes.
-"""
+"""The arrow of normal equations, and each derivative, are those of the dense problem."""
 
 import dataclasses
 

@@ -155,12 +155,7 @@ def test_mirrored_images_are_named() -> None:
 
 @pytest.mark.parametrize('field_deg', [0.3, 2.5])
 def test_a_narrow_field_does_not_estimate_what_it_cannot_show(field_deg: float) -> None:
-    """
-    The higher orders stay at their prior, and the result is better than with all of them free.
-
-    With free ones the error was 1.5 to 4 times the bound, since they trade with the principal
-    point, or the solution swung up to the limit of rounds.
-    """
+    """Free higher orders trade with the principal point: 1.5 to 4 bounds off, or not converged."""
     ratios = []
     for seed in range(4):
         given = scenario_of(field_deg, seed)

@@ -71,11 +71,7 @@ def test_a_step_equals_the_dense_one(m: int, damping: float) -> None:
 def decays(
     unit: np.ndarray,
 ) -> tuple[Callable[[np.ndarray], NormalEquations], Move, Callable[[np.ndarray], np.ndarray]]:
-    """
-    Twelve noisy decays ``c exp(-a t) + d exp(-b t)``: a, b shared; c, d per decay.
-
-    The state is (2 + 24,), each unknown in its own ``unit`` (4,).
-    """
+    """Twelve decays ``c exp(-a t) + d exp(-b t)`` with noise; a, b shared; in ``unit`` (4,)."""
     rng = np.random.default_rng(2)
     t = np.linspace(0, 4, 25)
     own = rng.uniform(1, 5, (12, 2))

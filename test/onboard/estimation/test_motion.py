@@ -139,11 +139,7 @@ NOISY = World(rate_deg_s=0.05, row_s=20e-3 / 1024, tracker_arcsec=20.0, tracker_
 def test_rates_by_samples_with_errors_of_their_own_show_no_absent_readout(
     stated: dict[str, object], filter_s: float
 ) -> None:
-    """
-    Errors of rates between which stars do not differ seemed to show that none is read late.
-
-    Error over sigma was 2.0 in the rms of six campaigns by slopes, and over 10 by differences.
-    """
+    """Rates that stars do not tell apart were 2.0 sigma off by slopes, over 10 by differences."""
     in_sigma = []
     for seed in range(4):
         made = simulate(dataclasses.replace(NOISY, filter_s=filter_s), seed)

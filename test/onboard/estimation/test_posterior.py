@@ -84,12 +84,7 @@ def normalised(log: Floats) -> Floats:
 def with_lens_term(
     made: Small, precision: Floats, mean: Floats, covariance: Floats
 ) -> tuple[Floats, Floats]:
-    """
-    Mean and covariance of a mixture over the amplitude of the next term of the lens.
-
-    Its outer product comes to the prior covariance of the field: an update of rank one by Sherman
-    and Morrison.
-    """
+    """Mixture over the amplitude of the next lens term: rank-one updates of Sherman-Morrison."""
     term = np.zeros(len(mean))
     term[made.layout.of(['field'])] = made.layout['field'].term
     pull = np.where(np.isfinite(precision), precision, 0.0) * term
@@ -218,11 +213,7 @@ def weighted(
 
 
 def shared(given: Small, place_px: float, cell_px: float) -> tuple[Shared, dict[str, Floats]]:
-    """
-    Random shared errors, and their dense covariances (2 n, 2 n) by name.
-
-    With that of independent errors beyond the working weights.
-    """
+    """Random shared errors; dense covariances (2 n, 2 n) by name, one of errors beyond weights."""
     rng = np.random.default_rng(4)
     n = len(given.table)
     from_sky = Rotation.from_euler('z', rng.uniform(0.0, 6.0, (n, 1))).as_matrix()[:, :2, :2]

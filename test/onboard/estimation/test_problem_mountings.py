@@ -154,11 +154,7 @@ def test_without_images_of_the_first_its_alignment_has_the_sigma_of_the_mounting
 
 @pytest.mark.parametrize('jump_deg', [0.0, 0.5])
 def test_a_star_tracker_that_drifts_is_named_and_loses_no_image(jump_deg: float) -> None:
-    """
-    240 arcsec over the campaign, 48 sigma of one image: no image is a misfit.
-
-    One attitude that jumps is, and hides no drift.
-    """
+    """240 arcsec, 48 sigma of an image: none is a misfit; one that jumps is, hiding no drift."""
     given, ensemble = campaign(4, [0, 1, 2] * 12, np.array([240.0 / 36, 0.0, 0.0]))
     images = list(ensemble.images)
     attitude = Rotation.from_quat(images[31].icrf_from_star_tracker_xyzw)

@@ -137,11 +137,7 @@ def errors_of(
 def campaign(
     rng: Generator, place_px: float = 0.0, cells_px: float = 0.0
 ) -> tuple[SharedError, ...]:
-    """
-    Errors found in 30 images of 60 stars, rolled at random, that share what is planted.
-
-    Cells are those of the finest octave.
-    """
+    """Errors of 60 stars in 30 rolled images, with star places and finest cells planted."""
     m, n, noise_px = 30, 60, 0.1
     star = np.tile(np.arange(n), m)
     pixels = rng.uniform(0.0, WIDTH - 1.0, (m * n, 2))
@@ -262,12 +258,7 @@ def test_what_a_star_shares_is_of_one_size_or_grows_with_its_faintness(place_px,
 
 @pytest.mark.parametrize('of_star', [True, False])
 def test_what_stars_of_one_field_share_may_be_structure_of_the_detector(of_star: bool) -> None:
-    """
-    Each star comes to one place of the detector: neighbours tell its error from a wave.
-
-    Of 400 stars some 140 pairs are neighbours in a cell of the first kind; pairs in the finer
-    cells are of the same stars and count once.
-    """
+    """Neighbours, 140 pairs in coarse cells, tell stars from waves; finer ones are of one star."""
     m, n, size_px, variances = 25, 400, 0.07, []
     star = np.tile(np.arange(n), m)
     for seed in range(8):

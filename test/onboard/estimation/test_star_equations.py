@@ -55,11 +55,7 @@ def dense_blocks(
     rotations: np.ndarray,
     loss_scale: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """
-    Whitened squared residuals (n,) of the kept stars, and J' W J (m, p + 4, p + 4).
-
-    A star of the square s has the weight 1 / (1 + s / c^2): the derivative of Cauchy's loss by s.
-    """
+    """Whitened squares (n,) and J' W J (m, p + 4, p + 4), weight 1 / (1 + s / c^2) by Cauchy."""
     size = len(camera.parameters) + 4
     blocks, squared = np.zeros((table.image_count, size, size)), []
     for k in np.nonzero(keep)[0]:

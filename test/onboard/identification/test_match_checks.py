@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-Brightnesses and lost lines expose false matches and do not affect true ones.
-
-Frames with lost lines are refused, those with a wrong prior are not.
-"""
+"""Brightness and lost lines expose false matches, not true ones; a wrong prior is not refused."""
 
 import dataclasses
 import functools

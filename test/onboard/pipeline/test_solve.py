@@ -1,9 +1,5 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
-"""
-From an ensemble to a calibration: statistics, verdict, provenance; what cannot be solved.
-
-The lens model that is chosen is the smallest that describes the stars.
-"""
+"""From an ensemble to a calibration: the smallest lens model, statistics, verdict; refusals."""
 
 import dataclasses
 import hashlib

@@ -280,11 +280,7 @@ def test_an_ordinary_star_is_measured_and_a_saturated_one_refused(options) -> No
 
 @pytest.mark.parametrize('off', [(0.4, 0.4), (-0.4, -0.4)])
 def test_a_saturated_plateau_is_found_where_it_was_predicted(off: tuple[float, float]) -> None:
-    """
-    The star is measured by what is left of it: its full flux, as well as its covariance states.
-
-    No pixel of a plateau is the brightest: a window moved to one of them may lose the star.
-    """
+    """With its full flux; a window moved to one of its many brightest pixels may lose the star."""
     wide = dataclasses.replace(QUIET, psf_sigma_px=1.6)
     at = np.array([[300.3, 200.6]])
     xy = np.concatenate([at, [p for p in star_grid(3) if np.abs(p - at).max() > 25.0]])
