@@ -181,7 +181,7 @@ def of_images(bins: list[ResidualBin]) -> list[ResidualBin]:
 
 
 def test_few_images_of_a_lens_with_structure_are_predicted() -> None:
-    """Less an image, information is nearly singular in the mean over amplitudes, not at the mode."""
+    """Less an image, information is nearly singular: in the mean over amplitudes, not the mode."""
     given, ensemble = observed(21, images=5)
 
     def move(pixels: Floats) -> Floats:
