@@ -13,8 +13,9 @@ from starcal_ros.identification.star_finder import Exposure, observe_stars, Star
 from starcal_ros.identification.tracking import start_tracking, track_stars, TrackedCamera
 from starcal_ros.records import CameraGeometry, Image, StarObservations
 from starcal_ros.stars.centroiding import Centroids, measure_stars
-from starcal_ros.stars.detection import detect, measure_background
-from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image
+from starcal_ros.stars.detection import Background, detect, measure_background
+from starcal_ros.stars.image_model import CentroidOptions, ImageModel, model_image, uniform_width
+from starcal_ros.stars.pixel_noise import PixelNoise
 
 CENTROIDS = CentroidOptions()
 QUIET = Detector(cosmic_rays=0.0, hot_fraction=0.0)
@@ -49,6 +50,14 @@ def measured(
 ) -> Centroids:
     """Centroids of the stars of an image that are at or near these pixels (n, 2)."""
     return measure_stars(pixels, xy, modelled(pixels, options), options)
+
+
+def image_model(noise_dn: float, shape: tuple[int, int] = (33, 33)) -> ImageModel:
+    """Model of an image with stars of 0.95 px on a sky of this noise."""
+    mesh = np.zeros((1, 1), np.float32)
+    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn, shape)
+    psf = uniform_width(0.95, shape[1], shape[0])
+    return ImageModel(background, psf, PixelNoise(4.0, 0.0), 4095.0, np.zeros(3), np.zeros(3))
 
 
 def with_planets(scenario: Scenario, shown: Scene, seed: int) -> Scene:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from sample_sky import errors_sigma, tracked  # type: ignore[import-not-found]
+from sample_sky import errors_sigma, image_model, tracked  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.rendering import star_electrons
 from starcal_ground.simulation.scenario import scenario
@@ -20,8 +20,7 @@ from starcal_ros.identification.blending import (
 )
 from starcal_ros.identification.star_finder import IdentificationOptions, StarSearch
 from starcal_ros.sky.catalog import cone, DEEPER_MAG, load_catalog
-from starcal_ros.stars.detection import Background
-from starcal_ros.stars.image_model import ImageModel, uniform_width
+from starcal_ros.stars.image_model import ImageModel
 from starcal_ros.stars.pixel_noise import PixelNoise
 from starcal_ros.stars.psf_fit import fit_psf, stamp_radius_px
 
@@ -39,14 +38,6 @@ def pull_of_a_neighbour(
     fit = fit_psf(stamp, SIGMA_PX, np.array([noise_dn]), PixelNoise(4.0, 0.0))
     x_px, y_px, found_dn, _ = fit.parameters[0].tolist()
     return math.hypot(x_px, y_px), math.sqrt(fit.covariance[0, 0, 0]), found_dn
-
-
-def image_model(noise_dn: float) -> ImageModel:
-    mesh = np.zeros((1, 1), np.float32)
-    background = Background(mesh, mesh + np.float32(noise_dn), 0.0, noise_dn, (0, 0))
-    noise = PixelNoise(4.0, 0.0)
-    psf = uniform_width(SIGMA_PX, 33, 33)
-    return ImageModel(background, psf, noise, 4095.0, np.zeros(3), np.zeros(3))
 
 
 def pulls_on(

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sample_sky import exposure_of, started, with_pixels  # type: ignore[import-not-found]
+from sample_sky import exposure_of, image_model, started, with_pixels  # type: ignore[import-not-found]
 
 from starcal_ground.simulation.scenario import scenario
 from starcal_ros.errors import ImageRefused
@@ -23,9 +23,6 @@ from starcal_ros.identification.tracking import track_stars
 from starcal_ros.records import StarRefusal
 from starcal_ros.sky.catalog import load_catalog
 from starcal_ros.stars.centroiding import Centroids
-from starcal_ros.stars.detection import Background
-from starcal_ros.stars.image_model import ImageModel, uniform_width
-from starcal_ros.stars.pixel_noise import PixelNoise
 
 SCENARIO = scenario('tiny', seed=31)
 PRIOR = SCENARIO.prior
@@ -124,15 +121,7 @@ def test_columns_that_are_shifted_are_told() -> None:
 
 MIN_SNR = 5.0
 ZERO_POINT = 17.0  # a star of that magnitude gives 1 DN
-MESH = np.ones((1, 1), np.float32)
-MODEL = ImageModel(
-    Background(0.0 * MESH, 2.0 * MESH, 0.0, 2.0, SHAPE),
-    uniform_width(0.95, SHAPE[1], SHAPE[0]),
-    PixelNoise(4.0, 0.0),
-    4095.0,
-    np.zeros(3),
-    np.zeros(3),
-)
+MODEL = image_model(2.0, SHAPE)
 
 
 def sky(count: int, scatter_mag: float, seed: int = 1) -> tuple[np.ndarray, np.ndarray, Centroids]:
