@@ -6,6 +6,7 @@ import math
 import os
 from pathlib import Path
 import re
+from typing import Any
 import zipfile
 
 from hypothesis import given, settings
@@ -45,9 +46,8 @@ def test_values_of_yaml(text: str, value: object) -> None:
     assert yaml_value(text) == value
 
 
-@pytest.mark.parametrize(
-    ('text', 'says'),
-    [
+REFUSED = {
+    yaml_value: [
         ('a: 1\na: 2', "line 2: duplicate key 'a'"),
         ('5: 1', 'line 1: key 5 is not a text'),
         ('no: 1', 'line 1: key False is not a text'),
@@ -67,16 +67,7 @@ def test_values_of_yaml(text: str, value: object) -> None:
         ('a: [', 'not YAML: .*line 2, column 1'),
         ('x\ud800', 'surrogates not allowed'),
     ],
-)
-def test_yaml_that_is_refused(text: str, says: str) -> None:
-    with pytest.raises(ValueError, match=says) as caught:
-        yaml_value(text)
-    assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
-
-
-@pytest.mark.parametrize(
-    ('text', 'says'),
-    [
+    json_value: [
         ('{"a": 1, "b": {"c": 1, "c": 2}}', "duplicate key 'c'"),
         ('[NaN]', 'NaN is not a number of JSON'),
         ('5' * 5000, 'a number of more than 400 digits'),
@@ -87,11 +78,16 @@ def test_yaml_that_is_refused(text: str, says: str) -> None:
         ('[' + 100_001 * '[],' + '1]', 'more than 100000 lists'),
         ('', 'not JSON: Expecting value'),
     ],
+}
+
+
+@pytest.mark.parametrize(
+    ('read', 'text', 'says'), [(read, *row) for read, rows in REFUSED.items() for row in rows]
 )
-def test_json_that_is_refused(text: str, says: str) -> None:
+def test_yaml_and_json_that_are_refused(read: Any, text: str, says: str) -> None:
     with pytest.raises(ValueError, match=says) as caught:
-        json_value(text)
-    assert '\n' not in str(caught.value)
+        read(text)
+    assert '\n' not in str(caught.value) and len(str(caught.value)) < 300
 
 
 # A text of digits and an E is a number here, which PyYAML writes without quotes; JSON's Infinity
