@@ -1,7 +1,6 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The state folder: what was kept comes back, through kills, damage and files without access."""
 
-from collections.abc import Iterator
 import contextlib
 import dataclasses
 import json
@@ -274,7 +273,7 @@ def test_the_key_file(tmp_path) -> None:
             read_seal(str(tmp_path / name))
 
 
-NOBODY = 65534
+NOBODY = 65534  # a user who owns none of the files
 IMAGE, REFUSED = 'ensemble/00000001.mcap', 'ensemble/refused.json'
 EVENT = 'calibrations/00000002_calibration_00000002.json'
 STOPS, SKIPPED, SET_ASIDE = 'cannot be read', 'not a regular file, skipped', 'set aside'
@@ -306,16 +305,6 @@ def start(folder: Path) -> tuple[str, list[str]]:
         return str(error), []
 
 
-@contextlib.contextmanager
-def as_nobody() -> Iterator[None]:
-    """The process as a user who owns none of the files; as it is where it may not change that."""
-    with contextlib.ExitStack() as stack:
-        if os.geteuid() == 0:  # modes stop any other user already
-            os.seteuid(NOBODY)
-            stack.callback(os.seteuid, 0)
-        yield
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(('kind', 'name', 'outcome'), CASES)
 def test_only_what_was_read_and_is_wrong_is_set_aside(kind, name, outcome) -> None:
@@ -330,7 +319,10 @@ def test_only_what_was_read_and_is_wrong_is_set_aside(kind, name, outcome) -> No
         for path in (Path(place), folder, *folder.iterdir()):
             if path.stat().st_mode & 0o777:
                 path.chmod(0o777)  # anybody may rename the files
-        with as_nobody():
+        with contextlib.ExitStack() as stack:
+            if os.geteuid() == 0:  # modes stop any other user already
+                os.seteuid(NOBODY)
+                stack.callback(os.seteuid, 0)
             error, damage = start(folder)
         for path in folder.iterdir():
             path.chmod(0o700)

@@ -121,9 +121,7 @@ def test_nodes_that_are_not_active(vehicle) -> None:
         assert set(values) == documented()
 
 
-def test_a_silent_topic_is_warned_of_once_and_sensor_data_are_received(
-    vehicle,
-) -> None:
+def test_a_silent_topic_is_warned_of_once_and_sensor_data_are_received(vehicle) -> None:
     """Best effort, as drivers offer it: all inputs connect, remapped or not."""
     node = vehicle.start('star_observer', ros=REMAPS)
     vehicle.until(lambda: f'{ATTITUDES}: no message in 5 s, from 0 pub' in node.said())

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from rcl_interfaces.msg import Parameter, ParameterType, ParameterValue
 from rcl_interfaces.srv import DescribeParameters, SetParameters
+from rclpy.expand_topic_name import expand_topic_name
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, Imu, Temperature
 from std_srvs.srv import Trigger
@@ -482,7 +483,7 @@ def test_the_policies_name_what_the_nodes_have(vehicle, tmp_path) -> None:
         profile = ElementTree.parse(path).getroot().find('enclaves/enclave/profiles/profile')
         assert profile is not None and profile.get('node') == name and profile.get('ns') == '/'
         allowed = {
-            (kind, full_name(name, str(element.text)))
+            (kind, expand_topic_name(str(element.text), name, '/'))
             for group in profile
             for kind in ('publish', 'subscribe', 'reply', 'request')
             if group.get(kind) == 'ALLOW'
@@ -492,13 +493,6 @@ def test_the_policies_name_what_the_nodes_have(vehicle, tmp_path) -> None:
             allowed -= {('publish', '/tf_static'), ('subscribe', '/tf_static')}
         vehicle.until(functools.partial(shows, vehicle, name, allowed))
         assert of_graph(vehicle, name) == allowed, name
-
-
-def full_name(node: str, name: str) -> str:
-    """Name in a policy, resolved for a node in the root namespace."""
-    if name.startswith('~/'):
-        return f'/{node}/{name[2:]}'
-    return name if name.startswith('/') else f'/{name}'
 
 
 def of_graph(client: Client, name: str) -> set[tuple[str, str]]:

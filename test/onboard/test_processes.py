@@ -4,13 +4,13 @@
 from collections.abc import Iterator
 import ctypes
 import os
-import subprocess
 import sys
 import threading
 from types import FrameType
 
 import attacks  # type: ignore[import-not-found]
 import pytest
+from starcal_tool import run_python  # type: ignore[import-not-found]
 from threadpoolctl import threadpool_info, threadpool_limits, ThreadpoolController
 
 import starcal_ground
@@ -81,9 +81,7 @@ print(len(found), max(found))
 
 def test_a_library_that_is_loaded_later_has_one_thread_too() -> None:
     """NumPy and SciPy bring one each."""
-    threads = {**os.environ, 'OPENBLAS_NUM_THREADS': '2'}
-    command = [sys.executable, '-c', LOADED_LATER]
-    done = subprocess.run(command, env=threads, capture_output=True, text=True)
+    done = run_python('-c', LOADED_LATER, env={**os.environ, 'OPENBLAS_NUM_THREADS': '2'})
     assert done.stdout.split()[1:] == ['1'], done.stdout + done.stderr
 
 
@@ -133,7 +131,6 @@ print(before_mb - resident_mb())
 
 @pytest.mark.skipif(not hasattr(ctypes.CDLL(None), 'malloc_trim'), reason='glibc alone has it')
 def test_freed_memory_between_other_returns_to_the_system() -> None:
-    command = [sys.executable, '-c', GAPS_IN_MEMORY]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = run_python('-c', GAPS_IN_MEMORY)
     assert (done.returncode, done.stderr) == (0, '')
     assert float(done.stdout) > 80.0  # of 100 MB; each gap loses less than two of its 24 pages

@@ -304,13 +304,15 @@ def interface(directions: str) -> dict[str, str]:
     return dict(rows)
 
 
+TOPICS = {name.lstrip('/') for name in interface('sub|pub')}
+
+
 def check_ros_arguments(words: tuple[str, ...]) -> None:
     names = names_of(*OPTIONS)
-    topics = {name.lstrip('/') for name in interface('sub|pub')}
     for before, word in itertools.pairwise(words):
         name = word.partition(':=')[0]
         if before in ('-r', '--remap'):
-            assert name.lstrip('/') in topics or name.startswith('__'), words
+            assert name.lstrip('/') in TOPICS or name.startswith('__'), words
         if before in ('-p', '--param'):
             assert name in names, words
 
@@ -337,13 +339,11 @@ def test_what_a_ros2_line_names_is_there(line) -> None:
         kind = services[f'~/{service}']
         assert node == 'calibrator' and rest[2] == kind.replace('/', '/srv/')
     elif verb == 'topic':
-        names = {name.lstrip('/') for name in interface('sub|pub')}
-        assert rest[0] in ('echo', 'hz', 'list') and rest[1].lstrip('/') in names
+        assert rest[0] in ('echo', 'hz', 'list') and rest[1].lstrip('/') in TOPICS
     elif verb == 'bag':
-        names = {name.lstrip('/') for name in interface('sub|pub')}
         assert rest[0] in ('record', 'play', 'convert', 'info')
         if rest[0] == 'record':
-            assert {word.lstrip('/') for word in rest if word.startswith('/')} <= names
+            assert {word.lstrip('/') for word in rest if word.startswith('/')} <= TOPICS
     elif verb in ('param', 'lifecycle'):
         assert rest[1].lstrip('/') in ('star_observer', 'calibrator')
         if verb == 'param':

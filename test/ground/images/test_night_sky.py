@@ -420,9 +420,7 @@ def test_a_stated_lens_model_is_that_of_the_camera_found(tmp_path, model) -> Non
 
 
 @pytest.mark.slow
-def test_a_site_counts_where_times_are_known_and_the_ground_alone_is_not_stated(
-    tmp_path,
-) -> None:
+def test_a_site_counts_where_times_are_known_and_the_ground_alone_is_not_stated(tmp_path) -> None:
     frames = write_pngs(tmp_path / 'night', frames_of(3))
     photographs, _ = photographs_of([frames], 18.0, 10.0)  # of the small bag, within 1 %
     # Files have the time of this run; at those of the bag its fields are 66 degrees high here.
