@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Fixtures: a separate ROS domain, node processes, a client; the tool; the small bag."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Generator, Iterator
 import contextlib
 import dataclasses

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """Client of the lifecycle services of a node."""
 
+from __future__ import annotations
+
 from typing import Any, TYPE_CHECKING
 
 from lifecycle_msgs.msg import Transition

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """The nodes as processes: services, refusals, faults, parameters, signals; replay; permissions."""
 
+from __future__ import annotations
+
 import dataclasses
 import functools
 import importlib.util

@@ -1,6 +1,8 @@
 # Copyright 2026 starcal maintainers. SPDX-License-Identifier: Apache-2.0
 """`starcal_ros` is what the nodes import, each module imports alone, and start-up imports few."""
 
+from __future__ import annotations
+
 import ast
 from collections.abc import Iterator
 import graphlib
