@@ -3,7 +3,6 @@
 
 from collections.abc import Iterator
 import contextlib
-from contextlib import closing, contextmanager
 import dataclasses
 from pathlib import Path
 import subprocess
@@ -155,7 +154,7 @@ rclpy.spin(node)
 """
 
 
-@contextmanager
+@contextlib.contextmanager
 def driver(kept: Path) -> Iterator[None]:
     process = subprocess.Popen([sys.executable, '-c', DRIVER, str(kept), SERVICE])
     try:
@@ -166,7 +165,6 @@ def driver(kept: Path) -> Iterator[None]:
 
 
 def until_told(client: Client, outcome: str, level: bytes) -> None:
-
     def is_so() -> bool:
         newest, _, values = client.health('calibrator')
         return (newest, values.get('camera_driver')) == (level, outcome)
@@ -181,7 +179,7 @@ def test_driver_is_told_and_its_failures_are_seen(vehicle) -> None:
     until_told(vehicle, 'service not available; will be sent when it is', b'\x01')
 
     # A driver that takes the call and never answers: nobody spins its node.
-    with closing(Client()) as silent:
+    with contextlib.closing(Client()) as silent:
         silent.node.create_service(SetCameraInfo, SERVICE, lambda _, answer: answer)
         until_told(vehicle, 'no answer within 5 s', b'\x01')
         # The first failure was that the service was not there.
