@@ -9,6 +9,7 @@ import threading
 import time
 from typing import Any
 
+from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
 from rclpy.executors import ExternalShutdownException
 from rclpy.qos import DurabilityPolicy, QoSProfile
@@ -36,6 +37,7 @@ _POLL_S = 0.1  # longest time without a look at whether a signal has shut ROS do
 # A node is discovered subscription by subscription; messages before a match are lost.
 _SETTLED_S, _UNMATCHED_S = 0.5, 5.0
 _CLOCK_S = 0.01  # wall-clock period of /clock
+_DIAGNOSTICS = '/diagnostics'
 _LATCHED_TYPES = (
     message_codec.CALIBRATION_TYPE,
     message_codec.STATUS_TYPE,
@@ -73,6 +75,7 @@ class BagPlayer(printable_log.PrintableLog):
         self._observed = threading.Condition()
         self._observed_count = 0
         self._told: set[str] = set()
+        self._listeners: dict[str, int] = {}  # matched by each star observer, by its diagnostics
         # Observations in the bag itself must not pace the player or count as subscribers.
         kinds = {topic.type_name for topic in self._topics}
         self._paced = bool(self._images) and message_codec.OBSERVATIONS_TYPE not in kinds
@@ -80,6 +83,7 @@ class BagPlayer(printable_log.PrintableLog):
             self._observations = self.create_subscription(
                 ObservationsMessage, 'observations', self._on_observations, QoSProfile(depth=1000)
             )
+            self.create_subscription(DiagnosticArray, _DIAGNOSTICS, self._on_diagnostics, 10)
 
     def _played(self) -> list[reader.Topic]:
         """Topics that ROS can have, of an installed type; of several that of most messages."""
@@ -171,9 +175,10 @@ class BagPlayer(printable_log.PrintableLog):
             # The graph lists a subscription before messages reach it, and for a while after the
             # death of its node, when it is never matched.
             is_matched = all(n <= one.get_subscription_count() for n, one in ends)
-            return _SETTLED_S if is_matched else _UNMATCHED_S
+            is_heard = not awaits_answers or self._are_answers_heard()
+            return _SETTLED_S if is_matched and is_heard else _UNMATCHED_S
 
-        before: tuple[list[int], list[str]] | None = None
+        before: tuple[list[int], list[str], dict[str, int]] | None = None
         since_s = time.monotonic()
         while True:
             now_s = time.monotonic()
@@ -183,8 +188,9 @@ class BagPlayer(printable_log.PrintableLog):
                 *([] if not others or any(map(is_read, others)) else [' or '.join(others)]),
                 *([other] if other and not self._other_subscribers(other) else []),
             ]
-            if (counts, missing) != before:
-                before, since_s = (counts, missing), now_s
+            now = counts, missing, dict(self._listeners)
+            if now != before:
+                before, since_s = now, now_s
             if not missing and now_s >= since_s + settled_s():
                 return
             if now_s > deadline_s:
@@ -213,8 +219,29 @@ class BagPlayer(printable_log.PrintableLog):
 
     def _answering(self) -> set[tuple[str, str]]:
         """Nodes that publish observations, each by namespace and name."""
-        ends = self.get_publishers_info_by_topic(self._observations.topic_name)
+        return self._publishing(self._observations.topic_name)
+
+    def _publishing(self, topic: str) -> set[tuple[str, str]]:
+        ends = self.get_publishers_info_by_topic(topic)
         return {(end.node_namespace, end.node_name) for end in ends}
+
+    def _are_answers_heard(self) -> bool:
+        """
+        Return True if observations reach all their subscribers that the graph shows.
+
+        A star observer may discover the player before the calibrator.  Its diagnostics tell how
+        many subscribers it has matched; of a node without diagnostics nobody knows.
+        """
+        known = self.count_subscribers(self._observations.topic_name)
+        reporting = self._answering() & self._publishing(_DIAGNOSTICS)
+        names = (f'{namespace.rstrip("/")}/{name}' for namespace, name in reporting)
+        return all(self._listeners.get(name, 0) >= known for name in names)
+
+    def _on_diagnostics(self, message: Any) -> None:
+        for status in message.status:
+            for one in status.values:
+                if one.key == 'listeners' and one.value.isdecimal():
+                    self._listeners[status.hardware_id] = int(one.value)
 
     def _wait_for_observations(self, sent: int) -> None:
         """Wait while a star observer has too many images in its queue."""
@@ -306,7 +333,7 @@ def main(args: Sequence[str] | None = None) -> int:
     def work() -> int:
         nonlocal player, listener, executor
         player = BagPlayer()
-        executor = node.Executor(2)  # parameters, observations
+        executor = node.Executor(2)  # parameters; observations and diagnostics
         executor.add_node(player)
         listener = threading.Thread(target=_listen, args=[executor])
         listener.start()

@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 import cv2
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from geometry_msgs.msg import PoseStamped
 from mission_files import attitudes, images  # type: ignore[import-not-found]
 import pytest
@@ -83,6 +84,28 @@ def test_compressed_images_are_paced_for_the_node_that_observes(vehicle, bag) ->
     sent = reader.read_raw([bag], ['/image/compressed'])
     assert stamps_ns == [raw.log_time_ns for raw in sent]
     assert 'playing anyway' not in player.said()
+
+
+def test_images_wait_until_the_observer_reports_all_that_listen_to_it(vehicle, bag) -> None:
+    """One that had not discovered the calibrator yet published to nobody."""
+    node, name = vehicle.node, vehicle.node.get_fully_qualified_name()
+    health = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+    found: list[Any] = vehicle.collect(CompressedImage, '/image/compressed')
+    vehicle.collect(PoseStamped, '/attitude')
+    vehicle.collect(StarObservations, 'observations')  # and the player listens too
+    node.create_publisher(StarObservations, 'observations', 10)
+
+    def report(listeners: str) -> bool:
+        values = [KeyValue(key='listeners', value=listeners)]
+        status = DiagnosticStatus(hardware_id=name, values=values)
+        health.publish(DiagnosticArray(status=[status]))
+        return bool(found)
+
+    patient = 'wait_for_subscribers_s:=100.0'
+    vehicle.start_player(bag, patient, 'wait_for_topic:=observations')
+    vehicle.until(lambda: bool(node.count_publishers('/attitude')))
+    assert not vehicle.holds(lambda: report('1'), 2.0)  # four times as long as where all are heard
+    vehicle.until(lambda: report('2'))
 
 
 def test_what_was_latched_is_latched(vehicle, tmp_path, monkeypatch) -> None:
