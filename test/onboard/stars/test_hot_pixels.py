@@ -97,7 +97,7 @@ def test_large_detectors_are_scanned_in_turns() -> None:
     pixels[hot[:, 0], hot[:, 1]] = 300
     camera = CameraModel(2592, 2048, np.array([7e3, 0, 7e3, 1295.5, 1023.5, 0, 0, 0, 0, 0]))
     known, found = UNKNOWN, []
-    for looking in Rotation.from_euler('x', np.arange(22), degrees=True):
+    for looking in Rotation.from_euler('x', np.arange(22)[:, None], degrees=True):
         known = learn_hot_pixels(known, pixels, 100.0, 2.0, looking, camera)
         found.append(len(known.index))
     assert found == [0] * 11 + [1] * 5 + [2] * 5 + [3]
