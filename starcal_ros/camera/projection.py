@@ -376,12 +376,25 @@ def line_of_sight(camera: CameraModel, pixels: Floats) -> Floats:
                 step *= np.minimum(1.0, reach / np.maximum(length, 1e-300))[..., None]
                 step[np.isnan(step)] = 0.0
         xy = _inside(xy, xy - step, fold2)
-    determinant = _determinant(camera.lens.by_ideal(xy, distortion))
-    # Beyond the fold the distorted radius decreases: solutions there belong to another branch.
-    r2 = xy[..., 0] ** 2 + xy[..., 1] ** 2
     converged = np.abs(error).max(axis=-1) <= 1e-12 * (1 + np.abs(target).max(axis=-1))
-    xy[~converged | (determinant <= 0) | (r2 > fold2)] = np.nan
+    xy[~(converged & _before_fold(camera, xy))] = np.nan
     return lens.directions_of(camera.model, xy)
+
+
+def before_fold(camera: CameraModel, directions_camera: Floats) -> Mask:
+    """Mask (...) of directions (..., 3) in the camera frame that `line_of_sight` has."""
+    return _before_fold(camera, lens.ideal_points(camera.model, directions_camera))
+
+
+def _before_fold(camera: CameraModel, xy: Floats) -> Mask:
+    """
+    Mask (...) of ideal points (..., 2) on the branch of the optical axis.
+
+    Beyond the fold the distorted radius decreases: points there belong to another branch.
+    """
+    fold2 = lens.fold_radius2(camera.model, camera.distortion)
+    determinant = _determinant(camera.lens.by_ideal(xy, camera.distortion))
+    return np.asarray((determinant > 0.0) & (xy[..., 0] ** 2 + xy[..., 1] ** 2 <= fold2))
 
 
 def _determinant(J: Floats) -> Floats:

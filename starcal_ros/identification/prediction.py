@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from starcal_ros.arrays import Floats, Indices, Mask, rows_of
-from starcal_ros.camera import CameraModel, field_radius_rad, line_of_sight, project
+from starcal_ros.camera import before_fold, CameraModel, field_radius_rad, project
 from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import median, medians, RAYLEIGH_TO_SIGMA
 from starcal_ros.sky import astrometry
@@ -75,12 +75,9 @@ def predict(
     direction_camera = icrf_from_camera.inv().apply(direction_icrf)
     xy_px = project(camera, direction_camera)
     with np.errstate(invalid='ignore'):
-        # Far outside the image the distortion polynomial folds over: keep only the stars whose
-        # pixel maps back to their direction.
         near = in_image(xy_px, camera, margin_px)
-    near[near] &= np.einsum(
-        'ij,ij->i', line_of_sight(camera, xy_px[near]), direction_camera[near]
-    ) > np.cos(1e-6)
+    # Far outside the image the distortion polynomial may fold back into it.
+    near[near] = before_fold(camera, direction_camera[near])
     return Prediction(index, direction_icrf, direction_camera, xy_px, camera).select(near)
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from starcal_ros.arrays import Floats, Indices, Mask, Pixels, rows_of
+from starcal_ros.arrays import Floats, Indices, Mask, Pixels, Rows, rows_of
 from starcal_ros.records import StarRefusal
 from starcal_ros.robust_statistics import centre_and_scatter, MAD_TO_SIGMA, medians
 from starcal_ros.stars import detection, psf_fit
@@ -257,14 +257,16 @@ def _misshapen(fit: psf_fit.PsfFit, model: ImageModel) -> Mask:
     """Mask (n,) of the stars whose shape differs from the common one of the image."""
     departure = np.abs(fit.shape_change - model.shape_median)
     limit = np.maximum(MAX_SHAPE_CHANGE, 4.0 * model.shape_scatter)
-    other = ((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1)
-    misfit_sigma = np.minimum(fit.worst_pixel_sigma, _beyond_others(fit))
-    return np.asarray(other | (misfit_sigma > psf_fit.MISFIT_SIGMA))
+    other = np.asarray(((departure > limit) & (departure > 4.0 * fit.shape_sigma)).any(axis=1))
+    misfits = np.flatnonzero(fit.worst_pixel_sigma > psf_fit.MISFIT_SIGMA)
+    if len(misfits):
+        other[misfits] |= _beyond_others(fit, misfits) > psf_fit.MISFIT_SIGMA
+    return other
 
 
-def _beyond_others(fit: psf_fit.PsfFit) -> Floats:
+def _beyond_others(fit: psf_fit.PsfFit, stars: Rows) -> Floats:
     """
-    Largest residual (n,) of a pixel, less that of the other bright stars, over its noise.
+    Largest residual (k,) of a pixel of some stars, less that of bright ones, over its noise.
 
     Coma, diffraction and undersampling leave the same part of the flux of all stars in a pixel:
     its median is no fault of one of them, and its scatter, without that of the noise, is allowed.
@@ -278,8 +280,8 @@ def _beyond_others(fit: psf_fit.PsfFit) -> Floats:
         common = np.median(part, axis=0)
         scatter = MAD_TO_SIGMA * np.median(np.abs(part - common), axis=0)
         variance = np.maximum(scatter**2 - np.median(noise, axis=0) ** 2, 0.0)
-    beyond_dn = np.abs(fit.residual_dn - common * flux_dn)
-    sigmas = beyond_dn / np.sqrt(fit.sigma_dn**2 + variance * flux_dn**2)
+    beyond_dn = np.abs(fit.residual_dn[stars] - common * flux_dn[stars])
+    sigmas = beyond_dn / np.sqrt(fit.sigma_dn[stars] ** 2 + variance * flux_dn[stars] ** 2)
     return np.asarray(np.nan_to_num(sigmas).max(axis=1, initial=0.0))
 
 

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from starcal_ground.simulation.scenario import scenario, Scene, scene
+from starcal_ros.camera import CameraModel, line_of_sight, project
 from starcal_ros.identification.prediction import (
     fit_warp,
     in_image,
@@ -12,7 +13,9 @@ from starcal_ros.identification.prediction import (
     Prediction,
     warp_degree,
 )
+from starcal_ros.records import CameraGeometry
 from starcal_ros.robust_statistics import RAYLEIGH_TO_SIGMA
+from starcal_ros.sky.astrometry import apparent_directions
 from starcal_ros.sky.catalog import load_catalog
 
 SCENARIO = scenario('tiny', seed=6)
@@ -50,6 +53,21 @@ def test_stars_beyond_magnitude_and_margin_are_left_out() -> None:
     for column in ('catalog_index', 'direction_icrf', 'direction_camera', 'xy_px'):
         np.testing.assert_array_equal(getattr(shown, column), getattr(exact, column))
     assert shown.px_per_rad == exact.px_per_rad == SCENARIO.truth.camera.parameters[0]
+
+
+def test_a_star_beyond_the_fold_of_the_lens_is_not_predicted_in_the_image() -> None:
+    """The corners of this prior have no line of sight: beyond 42 degrees the radius decreases."""
+    camera = CameraModel(800, 640, np.r_[550.0, 0.0, 550.0, 399.5, 319.5, -0.4, np.zeros(4)])
+    upright = np.array([0.0, 0.0, 0.0, 1.0])
+    geometry = CameraGeometry(camera, upright)
+    found = predict(geometry, upright, SCENARIO.start_ns, CATALOG, 9.0, margin_rad=0.1)
+    sky = apparent_directions(CATALOG, SCENARIO.start_ns)
+    ahead = sky[sky[:, 2] > np.cos(np.radians(50.0))]
+    shown = np.count_nonzero(in_image(project(camera, ahead), camera, margin_px=55.0))
+    assert 1000 < len(found.xy_px) < shown - 1000
+    # The inverse ends at 1e-14 of the image plane, next to a fold with its root.
+    mapped_back = line_of_sight(camera, found.xy_px)
+    np.testing.assert_allclose(mapped_back, found.direction_camera, rtol=0, atol=1e-6)
 
 
 def bent(xy_px: np.ndarray) -> np.ndarray:
