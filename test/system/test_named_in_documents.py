@@ -57,6 +57,7 @@ SUFFIXES = (
 FOLDERS = (
     'bench|config|docs|examples|launch|requirements|starcal_ground|starcal_ros|studies|test|tools'
 )
+TOOLS_LEAVE = {'__pycache__', '_build', '.coverage'}
 ROLE = re.compile(r'(?<!`)`([^`\n]+(?:\n[^`\n]+)?)`(?!`)')  # in a docstring: one backtick
 NAME = re.compile(r'(?:\w+/)*[A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+')
 
@@ -75,7 +76,7 @@ def files() -> tuple[str, ...]:
     folders = (*FOLDERS.split('|'), '.ci', 'bags/tiny', 'debian', 'msg', 'srv')
     paths = [*ROOT.iterdir(), *(path for name in folders for path in (ROOT / name).rglob('*'))]
     names = (path.relative_to(ROOT) for path in paths if path.is_file())
-    return tuple(str(name) for name in names if not {'__pycache__', '_build'} & {*name.parts})
+    return tuple(str(name) for name in names if not TOOLS_LEAVE & {*name.parts})
 
 
 @functools.cache
