@@ -5,7 +5,8 @@ Does a test fail when a token of the code is wrong?  ``python -m tools.mutants [
 Draws mutants of the code in the folders, each with one operator, comparison, number or word
 changed, and runs the tests that run its line, those first that run the fewest lines, until one
 fails.  Which tests these are comes from one run of the fast tests under coverage.py; a line that
-none of them runs has the tests nearest to its module.  Each result is a line of the results file,
+runs at import has those that run a line with the name that it binds, and one that none of them
+runs has the tests nearest to its module.  Each result is a line of the results file,
 so a run that was stopped continues there.  All happens in copies of the last commit.
 """
 
@@ -13,7 +14,7 @@ from __future__ import annotations
 
 import argparse
 import ast
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from dataclasses import dataclass
 import io
@@ -23,6 +24,7 @@ import os
 from pathlib import Path
 from queue import Queue
 import random
+import re
 import subprocess
 import sys
 import tempfile
@@ -51,7 +53,27 @@ OTHERS = {
 MOST_TESTS = 80  # of those that run a line: a survivor takes a minute
 TIMEOUT_S = 600  # a mutant that does not end is killed too
 
-Tests = Mapping[str, Sequence[str]]  # by path and line
+
+@dataclass(frozen=True)
+class Tests:
+    """Tests by the ``path:line`` that they ran, and the number of lines that each ran."""
+
+    by_line: dict[str, set[str]]
+    sizes: dict[str, int]
+
+    def of(self, mutant: Mutant) -> list[str]:
+        """Tests that may kill a mutant, those first that ran the fewest lines."""
+        ran = self.by_line.get(f'{mutant.path}:{mutant.line}')
+        if not ran:
+            named = re.compile(rf'\b({_bound_by(mutant)})\b')
+            ran = {
+                test
+                for path in Path('starcal_ros').rglob('*.py')
+                for line, text in enumerate(path.read_text().splitlines(), 1)
+                if named.search(text)
+                for test in self.by_line.get(f'{path}:{line}', ())
+            }
+        return sorted(ran, key=self.sizes.__getitem__)[:MOST_TESTS]
 
 
 @dataclass(frozen=True)
@@ -149,7 +171,7 @@ def _contexts(copy: Path) -> Path:
 
 
 def _tests(contexts: Path) -> Tests:
-    """Tests that ran each line, by ``path:line``: those first that ran the fewest lines."""
+    """Return the tests of coverage data with a context for each test."""
     data = coverage.CoverageData(str(contexts))
     data.read()
     by_line: dict[str, set[str]] = {}
@@ -161,15 +183,27 @@ def _tests(contexts: Path) -> Tests:
             by_line[f'{package}{path}:{line}'] = ran
             for test in ran:
                 sizes[test] = sizes.get(test, 0) + 1
-    return {line: sorted(ran, key=sizes.__getitem__) for line, ran in by_line.items()}
+    return Tests(by_line, sizes)
+
+
+def _bound_by(mutant: Mutant) -> str:
+    """Names, with bars between them, that the innermost statement around a mutant binds."""
+    names: list[str] = []
+    for node in ast.walk(ast.parse(mutant.path.read_text())):
+        if isinstance(node, (ast.Assign, ast.AnnAssign, ast.ClassDef, ast.FunctionDef)):
+            first = min(one.lineno for one in (node, *getattr(node, 'decorator_list', ())))
+            if first <= mutant.line <= (node.end_lineno or 0):
+                stores = (one for one in ast.walk(node) if isinstance(one, ast.Name))
+                bound = [one.id for one in stores if isinstance(one.ctx, ast.Store)]
+                names = [node.name] if hasattr(node, 'name') else bound
+    return '|'.join(names)
 
 
 def _try(mutant: Mutant, tests: Tests, copies: Queue[Path]) -> tuple[Mutant, str]:
     """Return the mutant and the test that kills it, empty if none does."""
     copy = copies.get()
     try:
-        ran = tests.get(f'{mutant.path}:{mutant.line}', ())[:MOST_TESTS]
-        names = ran or list(map(str, nearest_tests([mutant.path])))
+        names = tests.of(mutant) or list(map(str, nearest_tests([mutant.path])))
         (copy / 'tests.txt').write_text('\n'.join(names))
         before = (copy / mutant.path).read_text()
         (copy / mutant.path).write_text(mutant.text())
