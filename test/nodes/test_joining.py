@@ -102,11 +102,12 @@ def test_nothing_is_dropped_but_by_a_reset(name, calibrators) -> None:
     assert set(numbers) == set(of_name.values())  # two calibrations never have one number
 
 
-def test_another_image_of_a_stamp_is_counted(calibrators) -> None:
+@pytest.mark.parametrize('differs', ['measured_px', 'catalog_id'])
+def test_another_image_of_a_stamp_is_counted(calibrators, differs: str) -> None:
     """The image of the folder stays, as the first of a stamp does, and counts of both are kept."""
     state = calibrators.run('P2 open A; P2 images 0 1; P2 close; open -; images 2')
     first = observations()[0]
-    state.add(dataclasses.replace(first, measured_px=first.measured_px + 0.25))
+    state.add(dataclasses.replace(first, **{differs: 2 * getattr(first, differs)}))
     for refusal in ('glare', 'no_stars'):
         state.add(dataclasses.replace(first, refusal=refusal))
     calibrators.run('P2 open A')

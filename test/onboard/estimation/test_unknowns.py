@@ -19,6 +19,7 @@ from four_images import (  # type: ignore[import-not-found]
 )
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.special import eval_jacobi
 from worlds import each_image, estimated, observed  # type: ignore[import-not-found]
 
@@ -36,7 +37,7 @@ from starcal_ros.estimation import unknowns
 from starcal_ros.estimation.calibrate import Estimate
 from starcal_ros.estimation.equations import tracker_turns
 from starcal_ros.estimation.options import CalibrationOptions
-from starcal_ros.estimation.problem import attitude_errors
+from starcal_ros.estimation.problem import attitude_errors, turn_derivatives
 from starcal_ros.estimation.tracker_errors import Rates
 from starcal_ros.estimation.unknowns import (
     Assumptions,
@@ -167,6 +168,13 @@ def test_the_camera_follows_a_large_turn_of_the_alignment(given: Small) -> None:
     after = attitude_errors(given.problem, state, state.camera_from_icrf)
     assert after == pytest.approx(before, abs=1e-14)
     assert np.array_equal(state.parameters, given.state.parameters)
+
+
+def test_a_step_turns_a_turned_camera_by_its_derivative() -> None:
+    turn, step = np.array([0.9, -0.4, 0.7]), 1e-6  # products of two steps remain
+    turned = Rotation.from_rotvec(-turn - step * np.eye(3)) * Rotation.from_rotvec(turn)
+    found = turn_derivatives(turn[None])[0]
+    assert found == pytest.approx(-turned.as_rotvec().T / step, abs=2 * step)
 
 
 MASS_ICRF = np.array([0.6, 0.8, 0.0])

@@ -127,9 +127,12 @@ def test_a_width_that_changes_over_the_field_is_learnt() -> None:
     camera = PRIOR.camera
     grid = pixel_grid(camera, 7, 5)
     true_px = detector.psf_sigma_at(grid, (camera.height, camera.width))
-    found_px = known.instrument.psf_width().at(grid)
+    width = known.instrument.psf_width()
+    found_px = width.at(grid)
     # 30 % wider in the corners; some 250 bright stars tell it to a few percent there.
     assert np.abs(found_px / true_px - 1.0).max() < 0.06
+    mean_px2 = np.mean(width.at(pixel_grid(camera, 400, 400)) ** 2)
+    assert width.sigma_px**2 == pytest.approx(mean_px2, rel=2e-3)  # the edges count
     # And no star's error is larger than it says.
     # 300 stars, two axes: known to 3 %, and some have companions fainter than the catalog.
     assert 0.85 < np.sqrt(np.mean(errors_sigma(one, observations) ** 2)) < 1.15
