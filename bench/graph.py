@@ -21,12 +21,13 @@ from starcal_ground.cli.node_processes import free_domain
 from starcal_ros.ros.node import make_message
 
 PROFILE = Path(__file__).parents[1] / 'config' / 'fastdds.xml'
+_HELD = contextlib.ExitStack()
 START_S = 240.0  # a node starts in 2 s; much slower on a busy machine
 
 
 def own_domain() -> None:
-    """Move this process and its children to an unused ROS domain."""
-    os.environ.update(free_domain())
+    """Move this process and its children to an unused ROS domain, held until the process ends."""
+    os.environ.update(_HELD.enter_context(free_domain()))
 
 
 def profile(name: str) -> contextlib.AbstractContextManager[None]:

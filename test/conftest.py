@@ -13,13 +13,14 @@ import os
 from pathlib import Path
 import shutil
 import signal
-import socket
 
 from forked_process import ForkedChild  # type: ignore[import-not-found]
 import hypothesis
 import pytest
 from starcal_tool import Answer, Starcal  # type: ignore[import-not-found]
 from vehicle import Client, NodeProcess, StartNode, Vehicle  # type: ignore[import-not-found]
+
+from starcal_ground.cli.node_processes import free_domain
 
 # Read when NumPy is loaded: two tests at once on two cores leave no core for more threads.
 os.environ.setdefault('OPENBLAS_NUM_THREADS', '1')
@@ -134,31 +135,12 @@ def made_once(tmp_path_factory: pytest.TempPathFactory) -> MadeOnce:
     return made
 
 
-def free_domain() -> int:
-    """Return a ROS domain without participants on this machine, of no other worker."""
-    # Workers choose before any of them has a participant: each has every n-th domain.
-    workers = int(os.environ.get('PYTEST_XDIST_WORKER_COUNT', '1'))
-    worker = int(os.environ.get('PYTEST_XDIST_WORKER', 'gw0').removeprefix('gw'))
-    rounds = 100 // workers
-    start = os.getppid() if workers > 1 else os.getpid()
-    for k in range(rounds):
-        domain = 1 + worker + workers * ((start + k) % rounds)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            try:
-                # The first participant of a domain holds this port (RTPS 9.6.1.1).
-                probe.bind(('', 7410 + 250 * domain))
-            except OSError:
-                continue
-            return domain
-    raise RuntimeError('no free ROS domain on this machine')
-
-
 @pytest.fixture(scope='session')
 def ros_domain() -> Iterator[None]:
-    """Set an unused ROS domain in the environment, for this process and its node processes."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv('ROS_DOMAIN_ID', str(free_domain()))
-        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    """Set a ROS domain of this process alone in the environment, for it and its nodes."""
+    with pytest.MonkeyPatch.context() as patch, free_domain() as environment:
+        for name, value in environment.items():
+            patch.setenv(name, value)
         yield
 
 

@@ -83,10 +83,10 @@ def calibrate_with_nodes(
     params, *_ = outputs(folder)
     content = {'/**': {'ros__parameters': dict(parameters)}}
     write_marked(params, yaml.safe_dump(content, sort_keys=False))
-    own_domain = {} if 'ROS_DOMAIN_ID' in os.environ else free_domain()
-    environment = {**os.environ, **own_domain}
     with contextlib.ExitStack() as stack:
         stack.enter_context(_ended_like_interrupted())
+        is_given = 'ROS_DOMAIN_ID' in os.environ
+        environment = {**os.environ, **({} if is_given else stack.enter_context(free_domain()))}
         state = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         nodes: dict[str, Process] = {}
         commands = {name: _node_command(name, params, state) for name in _NODES}
@@ -222,15 +222,23 @@ def _stop(process: Process) -> None:
                 process.wait(5.0)
 
 
-def free_domain() -> dict[str, str]:
-    """Environment of a ROS domain unused on this machine; raises NodeError if there is none."""
+@contextlib.contextmanager
+def free_domain() -> Iterator[dict[str, str]]:
+    """Hold a ROS domain unused on this machine; its environment.  Raises NodeError without one."""
     first = os.getpid() % 100
     for domain in (1 + (first + k) % 100 for k in range(100)):
         # The first participant of a domain holds UDP port 7400 + 250 domain + 10 (RTPS 9.6.1.1).
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        # None takes port + 2, which holds a domain whose participants are still to come.
+        with (
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as hold,
+            socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe,
+        ):
             try:
+                hold.bind(('', 7402 + 250 * domain))
                 probe.bind(('', 7410 + 250 * domain))
             except OSError:
                 continue
-        return {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+            probe.close()
+            yield {'ROS_DOMAIN_ID': str(domain), 'ROS_AUTOMATIC_DISCOVERY_RANGE': 'LOCALHOST'}
+            return
     raise NodeError('no free ROS domain on this machine: set ROS_DOMAIN_ID')

@@ -3,6 +3,7 @@
 
 import dataclasses
 import json
+import os
 from pathlib import Path
 import signal
 import subprocess
@@ -18,6 +19,7 @@ import yaml
 
 from starcal_ground.bags.frames import read_telemetry
 from starcal_ground.bags.reader import read_images, Topics
+from starcal_ground.cli.node_processes import free_domain
 from starcal_ground.comparison import alignment_difference_rad, compare, truth_like
 from starcal_ground.simulation import scenario as synthetic
 from starcal_ground.simulation import simulated_bag
@@ -160,6 +162,13 @@ def test_a_bag_cut_off_is_used_up_to_the_damage(tmp_path) -> None:
     calibration = read_calibration(tmp_path / 'out' / 'calibration.json')
     assert 3 <= calibration.images_used < 10
     assert_close_to_truth(calibration, read_truth(TINY / 'truth.json'))
+
+
+@pytest.mark.nodes
+def test_a_ros_domain_is_held_before_it_has_a_participant() -> None:
+    """Nodes of two runs of the tests answered for each other."""
+    with free_domain() as one, free_domain() as other:
+        assert one['ROS_DOMAIN_ID'] != other['ROS_DOMAIN_ID'] != os.environ['ROS_DOMAIN_ID']
 
 
 @pytest.mark.nodes
