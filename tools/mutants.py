@@ -179,7 +179,7 @@ def _tests(contexts: Path) -> Tests:
     for measured in data.measured_files():
         _, package, path = measured.rpartition('starcal_ros/')
         for line, names in data.contexts_by_lineno(measured).items() if package else ():
-            ran = {name.split('|')[0] for name in names if name}
+            ran = {name.rpartition('|')[0] for name in names if name}
             by_line[f'{package}{path}:{line}'] = ran
             for test in ran:
                 sizes[test] = sizes.get(test, 0) + 1
@@ -228,7 +228,10 @@ def _pytest(copy: Path, *arguments: str, timeout_s: float | None = TIMEOUT_S) ->
         return ''
     # Code that the tests import at their head ends pytest before a test, with words on stderr.
     said = [*run.stdout.splitlines(), *run.stderr.splitlines(), f'status {run.returncode}']
-    return next((line for line in said if line.startswith(('FAILED', 'ERROR'))), said[-2])
+    failed = next((line for line in said if line.startswith(('FAILED', 'ERROR'))), said[-2])
+    if failed.startswith('ERROR: not found'):
+        raise ValueError(f'{failed}: the contexts are of other tests')
+    return failed
 
 
 if __name__ == '__main__':
