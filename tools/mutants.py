@@ -3,17 +3,18 @@
 Does a test fail when a token of the code is wrong?  ``python -m tools.mutants [FOLDER ...]``.
 
 Draws mutants of the code in the folders, each with one operator, comparison, number or word
-changed, and runs the tests that run its line, those first that run the fewest lines, until one
+changed, and runs the tests that run its line, the shortest case of each test first, until one
 fails.  Which tests these are comes from one run of the fast tests under coverage.py; a line that
 runs at import has those that run a line with the name that it binds, and one that none of them
-runs has the tests nearest to its module.  Each result is a line of the results file,
-so a run that was stopped continues there.  All happens in copies of the last commit.
+runs has the tests nearest to its module.  Each result is a line of the results file, so a run that
+was stopped continues there.  All happens in copies of the last commit.
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import as_completed, ThreadPoolExecutor
 from dataclasses import dataclass
@@ -62,7 +63,7 @@ class Tests:
     sizes: dict[str, int]
 
     def of(self, mutant: Mutant) -> list[str]:
-        """Tests that may kill a mutant, those first that ran the fewest lines."""
+        """Tests that may kill a mutant: one case of each function, then more, shortest first."""
         ran = self.by_line.get(f'{mutant.path}:{mutant.line}')
         if not ran:
             named = re.compile(rf'\b({_bound_by(mutant)})\b')
@@ -73,7 +74,13 @@ class Tests:
                 if named.search(text)
                 for test in self.by_line.get(f'{path}:{line}', ())
             }
-        return sorted(ran, key=self.sizes.__getitem__)[:MOST_TESTS]
+        cases: Counter[str] = Counter()
+        order: dict[str, int] = {}
+        for test in sorted(ran, key=self.sizes.__getitem__):
+            function, _, _ = test.partition('[')
+            order[test] = cases[function]
+            cases[function] += 1
+        return sorted(order, key=order.__getitem__)[:MOST_TESTS]
 
 
 @dataclass(frozen=True)
