@@ -9,6 +9,7 @@ from pathlib import Path
 from geometries import turn_between  # type: ignore[import-not-found]
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from tiny_campaign import ensemble, image, TRUTH, values  # type: ignore[import-not-found]
 from worlds import each_image, honesty, observed, of_random_pointings  # type: ignore[import-not-found]
 
@@ -25,6 +26,7 @@ from starcal_ros.constants import ARCSECOND_RAD
 from starcal_ros.errors import OptionError, TooFewObservations
 from starcal_ros.estimation.calibrate import estimate_calibration
 from starcal_ros.estimation.options import CalibrationOptions, estimated_parameters
+from starcal_ros.identification.star_finder import realigned
 from starcal_ros.options import names_of
 from starcal_ros.pipeline import solve
 from starcal_ros.pipeline.setup import load_setup, OPTION_CLASSES, Setup, with_method
@@ -103,6 +105,11 @@ def test_a_solution_with_its_statistics(found: Calibration) -> None:
     # Ten images of 10, 10 and 40 arcsec: 13 in the mean, and 36 of the principal point, whose 0.3
     # px the alignment takes up.
     assert turn_between(found.geometry, TRUTH).magnitude() / ARCSECOND_RAD < 50
+    own = [realigned(found.geometry, one).star_tracker_from_camera for one in ensemble().images]
+    apart_rad = (Rotation.concatenate(own).mean().inv() * Rotation.concatenate(own)).as_rotvec()
+    scatter_arcsec = np.sqrt(apart_rad.var(axis=0).mean()) / ARCSECOND_RAD
+    # That of the estimate weighs stars by their covariances: 32.2 for 32.5.
+    assert found.alignment_scatter_arcsec == pytest.approx(scatter_arcsec, rel=0.03)
 
 
 def test_lateral_colour_is_estimated(setup: Setup, found: Calibration) -> None:
