@@ -406,7 +406,11 @@ def _rate_between_rad_s(images: Sequence[StarObservations]) -> float:
 
 @dataclass(frozen=True)
 class AttitudeErrors:
-    """Errors of the star trackers as the stars show them, and their variances."""
+    """
+    Errors of the star trackers as the stars show them, and their variances.
+
+    ``error_rad`` (m, 3): small passive rotations from the reported to the true attitudes.
+    """
 
     error_rad: Floats
     covariance_rad2: Floats
@@ -471,7 +475,7 @@ def _drift(
     time_ns: Indices, attitudes: AttitudeErrors, sigma_rad: Floats, here: Mask
 ) -> tuple[Floats, float, float]:
     """
-    Slope (3,) of the errors in time, arcsec/h; its length over the span; p-value of none.
+    Slope (3,) of the reported attitudes from the true ones, arcsec/h; its length; p-value of none.
 
     By the scatter about the slope: a drift raises the sigma of the star tracker that is estimated.
     """
@@ -480,7 +484,7 @@ def _drift(
     freedom = np.count_nonzero(used) - 2  # beside a mean and a slope
     if freedom < 1:
         return unknown
-    time_ns, error_rad = time_ns[used], attitudes.error_rad[used]
+    time_ns, error_rad = time_ns[used], -attitudes.error_rad[used]
     hours = (time_ns - time_ns[0]) / (3600 * NANOSECONDS_PER_SECOND)
     variance_rad2 = np.einsum('mii->mi', attitudes.covariance_rad2)[used]
     weight = 1.0 / (variance_rad2 + sigma_rad**2)

@@ -366,7 +366,8 @@ class StarTrackerAlignment(Record):
         Covariance of a small rotation of the mounting about the axes of the camera; zero for the
         first star tracker.
     drift_arcsec_per_hour : tuple of 3 float
-        Drift of the attitude against the stars, about the axes of the star tracker.
+        Drift of the attitude against the stars, about the axes of the star tracker: the passive
+        rotation from the true to the reported attitude, as in the residuals.
     drift_arcsec, drift_p_value : float
         Length of the drift over the time span of its images, and p-value of the hypothesis of no
         drift; NaN for fewer than four images.

@@ -168,6 +168,11 @@ def test_a_star_tracker_that_drifts_is_named_and_loses_no_image(jump_deg: float)
         assert sound.drift_p_value > 1e-4
     assert second.drift_p_value < 1e-9
     assert second.drift_arcsec == pytest.approx(240.0, abs=40.0)  # noise of 30 arcsec about z
+    # Its images are the second to the 35th of 36, a minute apart: 220 arcsec of the 240.
+    hours = second.drift_arcsec / np.linalg.norm(second.drift_arcsec_per_hour)
+    assert hours == pytest.approx(33 / 60)
+    about_x, *about_yz = hours * np.array(second.drift_arcsec_per_hour)
+    assert about_x == pytest.approx(220.0, abs=20.0) and np.abs(about_yz).max() < 40.0
     (refused,) = [
         one for one in star_tracker_gate(found.star_trackers, GateOptions()) if not one.passed
     ]
